@@ -1,0 +1,15 @@
+"""Orientation and shape class of an object from a single image, by icosahedral projection."""
+
+from typing import Any
+
+__version__ = "0.1.0"
+__all__ = ["__version__", "load"]
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever the attribute is
+    """Import `load` when it is first asked for: rendering processes never pay for torch."""
+    if name == "load":
+        from i2i.runs.loading import load
+
+        return load
+    raise AttributeError(f"module 'i2i' has no attribute {name!r}")

@@ -1,0 +1,75 @@
+"""The shell around every door: Hydra on the outside, plain error messages on the way out."""
+
+import sys
+from collections.abc import Callable
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from i2i.configuration import config_dir, register_resolvers
+from i2i.errors import ConfigurationError, I2IError
+
+
+def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
+    """Make a command of a function that takes a configuration.
+
+    Errors that a user can cause are printed without a traceback and end the process with status 1;
+    in a sweep they are handed to Hydra, which reports the job.
+
+    Args:
+        config_name: The YAML file at the top of `conf/` that belongs to the command.
+    """
+
+    def decorate(function: Callable[[DictConfig], object]) -> Callable[[], None]:
+        @hydra.main(version_base="1.3", config_path=config_dir(), config_name=config_name)
+        def shell(cfg: DictConfig) -> None:
+            try:
+                function(cfg)
+            except (I2IError, OmegaConfBaseException) as error:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise
+                print(f"error: {readable(error)}", file=sys.stderr)
+                sys.exit(1)
+
+        def main() -> None:
+            register_resolvers()
+            shell()
+
+        main.__doc__ = function.__doc__
+        return main
+
+    return decorate
+
+
+def readable(error: BaseException) -> str:
+    """The message of our own error inside what OmegaConf wrapped around it, if there is one."""
+    inner: BaseException | None = error
+    while inner is not None:
+        if isinstance(inner, I2IError):
+            return str(inner)
+        inner = inner.__cause__
+    if "Missing mandatory value" in str(error):
+        key = str(error).split("Missing mandatory value:")[-1].strip().splitlines()[0]
+        return f"{key} is not set: give it as {key}=... on the command line"
+    return str(error)
+
+
+def given_overrides() -> list[str]:
+    """What was typed on the command line; empty when called from Python."""
+    if not HydraConfig.initialized():
+        return []
+    return list(HydraConfig.get().overrides.task)
+
+
+def refuse(overrides: list[str], *, allowed: tuple[str, ...], reason: str) -> None:
+    """Refuse command-line words whose key does not start with one of the allowed prefixes.
+
+    Raises:
+        ConfigurationError: naming the words, the reason and what is allowed.
+    """
+    bad = [o for o in overrides if not o.lstrip("+~").startswith(allowed)]
+    if bad:
+        raise ConfigurationError(f"{reason}: leave out {' '.join(bad)} (allowed: {', '.join(allowed)})")
