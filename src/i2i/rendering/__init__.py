@@ -1,0 +1,22 @@
+"""Pictures from meshes: one interface, several renderers."""
+
+from i2i.rendering.base import CHANNELS, MODALITIES, Renderer, get_renderer, renderer_names
+from i2i.rendering.mesh import RenderMesh, prepare_mesh
+from i2i.rendering.reference import decimate_mesh, load_mesh, save_mesh
+from i2i.rendering.shading import encode_depth
+from i2i.rendering.visuals import Material
+
+__all__ = [
+    "CHANNELS",
+    "MODALITIES",
+    "Material",
+    "RenderMesh",
+    "Renderer",
+    "decimate_mesh",
+    "encode_depth",
+    "get_renderer",
+    "load_mesh",
+    "prepare_mesh",
+    "renderer_names",
+    "save_mesh",
+]
