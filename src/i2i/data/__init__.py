@@ -1,0 +1,1 @@
+"""Mesh sources, the rendered store, datasets and Lightning data modules."""
