@@ -1,0 +1,106 @@
+"""Trainable parameters and build time of each system against the numbers of the paper.
+
+    python benchmarks/parameter_counts.py
+
+Ends with status 1 if a count is not the expected one.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from i2i.models.i2i import I2IClassifier, I2IPose
+from i2i.nn.encoders import C4ResNet18, ResNet18
+from i2i.nn.group_convs import DynamicFilterConv
+from i2i.nn.projectors import IcosahedralProjector
+
+
+@dataclass(frozen=True)
+class System:
+    """One row.
+
+    Attributes:
+        name: What it is called in the tables.
+        paper: What the paper prints, rounded, or an empty string.
+        expected: The exact number.
+        build: Makes the network.
+    """
+
+    name: str
+    paper: str
+    expected: int
+    build: Callable[[], nn.Module]
+
+
+def pose(
+    *,
+    encoder: Callable[..., nn.Module] | None = None,
+    level: int = 1,
+    classes: int = 1,
+    channels: int = 1,
+) -> I2IPose:
+    """I2I at the paper's scale."""
+    return I2IPose(
+        encoder or partial(C4ResNet18, width=38),
+        partial(IcosahedralProjector, mesh_level=level),
+        partial(DynamicFilterConv, 128, mesh_level=level),
+        channels=channels,
+        num_classes=classes,
+        image_size=128,
+    )
+
+
+def classifier() -> I2IClassifier:
+    """I2I for the forty classes of ModelNet40."""
+    return I2IClassifier(
+        partial(C4ResNet18, width=38),
+        IcosahedralProjector,
+        partial(DynamicFilterConv, 128),
+        channels=1,
+        num_classes=40,
+        image_size=128,
+    )
+
+
+SYSTEMS = (
+    System("I2I, one class", "10.9 M", 10_861_283, pose),
+    System("I2I, ten classes", "10.9 M", 10_909_730, partial(pose, classes=10)),
+    System("I2I, one class, RGB", "", 10_862_119, partial(pose, channels=3)),
+    System("I2I, sparse projection", "", 10_857_443, partial(pose, level=0)),
+    System("I2I without E2CNN", "", 11_637_959, partial(pose, encoder=ResNet18)),
+    System(
+        "I2I, full basis, width 31",
+        "",
+        10_709_339,
+        partial(pose, encoder=partial(C4ResNet18, width=31, basis="full")),
+    ),
+    System("I2I, classification", "", 12_149_636, classifier),
+)
+
+
+def main() -> int:
+    table = Table("system", "paper", "expected", "ours", "build, s")
+    wrong = 0
+    SYSTEMS[0].build()  # the first one also computes the kernel bases
+    for system in SYSTEMS:
+        start = time.perf_counter()
+        network = system.build()
+        seconds = time.perf_counter() - start
+        ours = sum(p.numel() for p in network.parameters() if p.requires_grad)
+        wrong += ours != system.expected
+        mark = "" if ours == system.expected else "  WRONG"
+        table.add_row(
+            system.name, system.paper, f"{system.expected:,}", f"{ours:,}{mark}", f"{seconds:.2f}"
+        )
+    Console().print(table)
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

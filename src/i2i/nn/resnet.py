@@ -1,0 +1,111 @@
+"""The plain ResNet-18 style encoder of the baselines and of "I2I without E2CNN"."""
+
+import torch
+from torch import Tensor, nn
+
+_BLOCKS_PER_LAYER = 2
+
+
+class BasicBlock(nn.Module):
+    """Two 3×3 convolutions with batch norm and a shortcut; no biases.
+
+    Args:
+        in_channels: Channels in.
+        out_channels: Channels out.
+        stride: Of the first convolution and of the shortcut, which is a 1×1 convolution with batch
+            norm where the stride or the width changes.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, 1, bias=False)
+        self.norm1 = nn.BatchNorm2d(out_channels)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, 1, 1, bias=False)
+        self.norm2 = nn.BatchNorm2d(out_channels)
+        self.shortcut: nn.Module = nn.Identity()
+        if stride != 1 or in_channels != out_channels:
+            self.shortcut = nn.Sequential(
+                nn.Conv2d(in_channels, out_channels, 1, stride, bias=False),
+                nn.BatchNorm2d(out_channels),
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, in_channels, H, W) -> (B, out_channels, H / stride, W / stride)."""
+        out = torch.relu(self.norm1(self.conv1(x)))
+        out = self.norm2(self.conv2(out))
+        return torch.relu(out + self.shortcut(x))
+
+
+class ResNet18(nn.Module):
+    """ResNet-18 with a 5×5 stem, stride 2 in the first two layers and 1 in the last two.
+
+    The trunk only: pooling and heads belong to the models. Not pretrained, as in the paper.
+
+    Args:
+        in_channels: 1 for gray and depth, 3 for RGB.
+        width: Channels of the first layer (paper: 64).
+        image_size: Side of the square image in pixels.
+        layer_strides: Stride of each layer's first block.
+        max_pool: Whether the stem ends with a 3×3 max-pool of stride 2.
+
+    Attributes:
+        out_channels: 8 · width.
+        map_size: Side S of the output map.
+
+    Shape:
+        (B, in_channels, image_size, image_size) -> (B, out_channels, S, S).
+
+    Example:
+        >>> ResNet18(1, width=4, image_size=64)(torch.ones(2, 1, 64, 64)).shape
+        torch.Size([2, 32, 4, 4])
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        *,
+        width: int = 64,
+        image_size: int,
+        layer_strides: tuple[int, ...] = (2, 2, 1, 1),
+        max_pool: bool = True,
+    ) -> None:
+        super().__init__()
+        self.in_channels, self.image_size = in_channels, image_size
+        self.out_channels = width * 2 ** (len(layer_strides) - 1)
+        self.stem = nn.Conv2d(in_channels, width, 5, stride=2, padding=2, bias=False)
+        self.norm = nn.BatchNorm2d(width)
+        self.max_pool = nn.MaxPool2d(3, stride=2, padding=1) if max_pool else nn.Identity()
+
+        blocks: list[nn.Module] = []
+        channels = width
+        # Every strided step here keeps ceil(size / stride) cells.
+        size = -(-image_size // 2)
+        size = -(-size // 2) if max_pool else size
+        for layer, stride in enumerate(layer_strides):
+            size = -(-size // stride)
+            for index in range(_BLOCKS_PER_LAYER):
+                out_channels = width * 2**layer
+                stride_here = stride if index == 0 else 1
+                blocks.append(BasicBlock(channels, out_channels, stride=stride_here))
+                channels = out_channels
+        self.blocks = nn.Sequential(*blocks)
+        self.map_size = size
+        self._initialise()
+
+    def _initialise(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, out_channels, S, S)."""
+        expected = (self.in_channels, self.image_size, self.image_size)
+        if image.ndim != 4 or image.shape[1:] != expected:
+            raise ValueError(f"expected images of shape (B, {expected}), got {tuple(image.shape)}")
+        x = torch.relu(self.max_pool(self.norm(self.stem(image))))
+        return self.blocks(x)
+
+    def extra_repr(self) -> str:
+        """`128×128 -> 512 × 8×8`."""
+        size, side = self.image_size, self.map_size
+        return f"{size}×{size} -> {self.out_channels} × {side}×{side}"

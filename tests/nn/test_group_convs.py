@@ -1,0 +1,147 @@
+"""The icosahedral correlation against the written-out sum, its symmetries, and the oracle."""
+
+import pytest
+import torch
+
+from i2i.geometry.icosahedron import icosahedron
+from i2i.nn.group_convs import DynamicFilterConv
+from i2i.nn.projectors import IcosahedralProjector
+from i2i.testing import assert_icosahedral_equivariant, run_oracle
+
+
+def direct(conv, mesh, signal, index=None):
+    """`out(g) = Σ_v f(g v) ψ(v) + b`, element by element and vertex by vertex."""
+    batch = len(signal)
+    psi = signal.view(batch, conv.num_vertices, conv.features, conv.out_features)
+    out = torch.zeros(batch, 60, conv.out_features, dtype=signal.dtype)
+    for b in range(batch):
+        sphere = 0 if index is None else int(index[b])
+        for g in range(60):
+            for i, v in enumerate(mesh.visible.tolist()):
+                moved = mesh.action[g, v]
+                out[b, g] += conv.sphere[sphere, moved] @ psi[b, i]
+            out[b, g] += conv.bias[sphere]
+    return out
+
+
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("num_spheres", [1, 3])
+def test_equals_the_written_out_sum(level, num_spheres):
+    torch.manual_seed(0)
+    conv = DynamicFilterConv(5, 4, num_spheres=num_spheres, mesh_level=level).double()
+    index = torch.tensor([2, 0]) if num_spheres > 1 else None
+    signal = torch.randn(2, conv.num_vertices, 20, dtype=torch.float64)
+    with torch.no_grad():
+        out, expected = conv(signal, index), direct(conv, icosahedron(level), signal, index)
+    assert out.shape == (2, 60, 4)
+    torch.testing.assert_close(out, expected, atol=1e-12, rtol=1e-12)
+    single = conv.float()(signal.float(), index)
+    torch.testing.assert_close(single.double(), expected, atol=1e-6, rtol=1e-5)
+
+
+def _with_sphere(conv, signal):
+    def layer(sphere):
+        return torch.func.functional_call(conv, {"sphere": sphere[None]}, (signal.to(sphere),))
+
+    return layer
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_feature_side_symmetry(level):
+    torch.manual_seed(0)
+    conv = DynamicFilterConv(5, 3, mesh_level=level).double()
+    signal = torch.randn(2, conv.num_vertices, 15)
+    assert_icosahedral_equivariant(
+        _with_sphere(conv, signal), conv.sphere[0].detach(), mesh=icosahedron(level)
+    )
+
+
+def test_filter_side_symmetry_holds_for_the_five_turns_only():
+    """The half mesh goes into itself under the turns about its own axis and under no other."""
+    torch.manual_seed(0)
+    mesh = icosahedron(1)
+    conv = DynamicFilterConv(5, 3).double()
+
+    def layer(whole):  # a filter on all vertices, of which the layer takes the visible half
+        return conv(whole[:, mesh.visible])
+
+    on_half = torch.zeros(2, 42, 15)
+    on_half[:, mesh.visible] = torch.randn(2, 16, 15)
+    assert_icosahedral_equivariant(layer, on_half, side="filter", elements=range(5))
+    report = assert_icosahedral_equivariant(
+        layer, on_half, side="filter", elements=range(5, 60), raise_error=False
+    )
+    assert min(report.errors) > 0.05
+
+
+def test_unconstrained_layer_fails():
+    torch.manual_seed(0)
+    linear = torch.nn.Linear(42 * 5, 60 * 3)
+    with pytest.raises(AssertionError):
+        assert_icosahedral_equivariant(
+            lambda sphere: linear.to(sphere)(sphere.flatten()).view(60, 3), torch.randn(42, 5)
+        )
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_oracle_through_the_real_layers(normalize):
+    """A perfect encoder's maps, our projector and our correlation find the element of `view`."""
+    projector = IcosahedralProjector(
+        256, 1, map_size=8, relu=False, normalize_midpoints=normalize
+    ).double()
+    conv = DynamicFilterConv(256, 1).double()
+    torch.nn.init.zeros_(conv.bias)
+
+    @torch.no_grad()
+    def correlate(sphere, psi):
+        conv.sphere.copy_(sphere[None])
+        return conv(psi).squeeze(-1)
+
+    result = run_oracle(
+        normalize_midpoints=normalize, sampler=projector.sample, correlate=correlate
+    )
+    assert result.num_views >= 2000
+    assert result.nearest > (0.92 if normalize else 0.85)
+    assert result.one_of_two > 0.97
+    assert result.wrong_inverse < 0.5
+    assert result.wrong_frame < 0.5
+
+
+def test_published_axes_fail_the_oracle_on_rasters():
+    projector = IcosahedralProjector(256, 1, map_size=8, projector_axes="published").double()
+    result = run_oracle(num_fields=1, sampler=projector.sample)
+    assert result.nearest < 0.5
+
+
+def test_parameters_and_initial_values():
+    torch.manual_seed(0)
+    conv = DynamicFilterConv(128, 7)
+    assert sum(p.numel() for p in conv.parameters()) == 5_383
+    bound = (6 / (42 * 128 + 128)) ** 0.5
+    assert 0.95 * bound < conv.sphere.abs().max() <= bound
+    assert set(conv.state_dict()) == {"sphere", "bias"}
+
+
+def test_channel_order_is_output_fastest():
+    conv = DynamicFilterConv(2, 3)
+    torch.nn.init.zeros_(conv.bias)
+    signal = torch.zeros(1, 16, 6)
+    signal[0, 0, 1 * 3 + 2] = 1.0  # n = 1, m = 2 at the centre vertex
+    out = conv(signal)[0]
+    assert torch.equal(out[:, :2], torch.zeros(60, 2))
+    moved = icosahedron(1).action[:, 0]
+    torch.testing.assert_close(out[:, 2], conv.sphere[0, moved, 1])
+
+
+def test_errors():
+    conv = DynamicFilterConv(2, 3, num_spheres=2)
+    with pytest.raises(ValueError, match="class_id"):
+        conv(torch.zeros(1, 16, 6))
+    with pytest.raises(ValueError, match="16, 6"):
+        conv(torch.zeros(1, 6, 6), torch.tensor([0]))
+
+
+def test_repr_is_the_formula():
+    text = repr(DynamicFilterConv(128, 7, num_spheres=10))
+    assert "10 × f: V42 -> R^128" in text
+    assert "Σ_v f(g·v)ᵀ ψ(v)" in text

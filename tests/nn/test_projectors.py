@@ -1,0 +1,138 @@
+"""The projector: where it samples, and what it commutes with."""
+
+import math
+
+import pytest
+import torch
+
+from i2i.geometry.icosahedron import icosahedron
+from i2i.nn.projectors import IcosahedralProjector, sampling_positions, sampling_weights
+from i2i.testing import gaussian_sampler
+
+
+def sampler(map_size, sigma, **options):
+    return IcosahedralProjector(1, 1, map_size=map_size, sigma=sigma, **options).double()
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.2, 3.0])
+def test_weights_sum_to_one(sigma):
+    sampling = sampler(8, sigma).sampling
+    assert sampling.shape == (16, 64)
+    torch.testing.assert_close(sampling.sum(dim=1), torch.ones(16).double(), atol=1e-6, rtol=0)
+
+
+def test_centre_vertex_averages_the_four_middle_cells():
+    centre = sampler(8, 0.2).sampling[0].view(8, 8)
+    expected = torch.zeros(8, 8).double()
+    expected[3:5, 3:5] = 0.25
+    torch.testing.assert_close(centre, expected, atol=1e-6, rtol=0)
+
+
+def test_axes():
+    """A vertex to the right is sampled to the right, one above is sampled above."""
+    points = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    raster = sampling_positions(points, 10, coverage=0.8)
+    assert raster.tolist() == [[5.0, 5.0], [5.0, 9.0], [1.0, 5.0]]
+    published = sampling_positions(points, 10, coverage=0.8, projector_axes="published")
+    assert published.tolist() == [[5.0, 5.0], [9.0, 5.0], [5.0, 9.0]]
+    # A quarter turn apart: no mirror image.
+    turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    torch.testing.assert_close((raster - 5) @ turn.T @ turn.T @ turn.T, published - 5)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_agrees_with_the_written_out_sampler(normalize):
+    mesh = icosahedron(1, normalize_midpoints=normalize)
+    maps = torch.randn(3, 5, 8, 8, dtype=torch.float64)
+    ours = sampler(8, 0.35, coverage=0.8, normalize_midpoints=normalize).sample(maps)
+    expected = gaussian_sampler(mesh, map_size=8, sigma=0.35, coverage=0.8)(maps)
+    torch.testing.assert_close(ours, expected, atol=1e-6, rtol=1e-6)
+
+
+def test_sigma_units():
+    assert sampler(8, 0.2, sigma_unit="halfwidth").sigma_cells == pytest.approx(0.8)
+    torch.testing.assert_close(
+        sampler(10, 0.2, sigma_unit="halfwidth").sampling, sampler(10, 1.0).sampling
+    )
+
+
+def test_sampling_commutes_with_the_linear_map():
+    torch.manual_seed(0)
+    projector = IcosahedralProjector(6, 20, map_size=8)
+    features = torch.randn(3, 6, 8, 8)
+    mapped = torch.einsum("oc,bcij->boij", projector.linear.weight, features)
+    mapped = mapped + projector.linear.bias[:, None, None]
+    direct = torch.einsum("boij,vij->bvo", mapped, projector.sampling.view(16, 8, 8)).relu()
+    torch.testing.assert_close(projector(features), direct, atol=1e-5, rtol=1e-5)
+    assert (projector(features) >= 0).all()
+    projector.relu = False
+    assert (projector(features) < 0).any()
+
+
+def smooth_maps(map_size, angle):
+    """Random smooth functions on the map, turned counter-clockwise by `angle`: (64, S, S)."""
+    generator = torch.Generator().manual_seed(0)
+    frequency = 3.0 * torch.randn(64, 2, generator=generator, dtype=torch.float64)
+    phase = 2 * math.pi * torch.rand(64, generator=generator, dtype=torch.float64)
+    centre = (torch.arange(map_size, dtype=torch.float64) + 0.5 - map_size / 2) / (0.45 * map_size)
+    b, a = torch.meshgrid(-centre, centre, indexing="ij")
+    cosine, sine = math.cos(angle), math.sin(angle)
+    x, y = cosine * a + sine * b, -sine * a + cosine * b  # turned back
+    wave = frequency[:, 0, None, None] * x + frequency[:, 1, None, None] * y
+    return torch.cos(wave + phase[:, None, None])
+
+
+def in_plane_error(map_size, sigma):
+    """Relative error of the permutation under a turn by 72°."""
+    permutation = icosahedron(1).visible_permutation[1]  # vertex i goes to permutation[i]
+    sample = sampler(map_size, sigma).sample
+    before = sample(smooth_maps(map_size, 0.0)[None])[0]
+    after = sample(smooth_maps(map_size, 2 * math.pi / 5)[None])[0]
+    return ((after[permutation] - before).norm() / before.norm()).item()
+
+
+def test_turn_by_72_degrees_permutes_the_samples():
+    assert in_plane_error(33, 0.2 * 33 / 8) < 0.01
+    assert in_plane_error(65, 0.2 * 65 / 8) < 0.003
+
+
+def test_in_plane_error_at_the_working_size_falls_with_sigma():
+    errors = [in_plane_error(8, sigma) for sigma in (0.2, 0.35, 0.5, 0.8)]
+    assert errors == sorted(errors, reverse=True)
+    for error, expected in zip(errors, (0.40, 0.19, 0.08, 0.03), strict=True):
+        assert expected / 2.5 < error < expected * 2.5
+
+
+def test_levels():
+    assert IcosahedralProjector(2, 3, map_size=8, mesh_level=0).num_vertices == 6
+    assert IcosahedralProjector(2, 3, map_size=8, mesh_level=1).num_vertices == 16
+
+
+def test_state_dict_is_the_parameters():
+    assert set(IcosahedralProjector(2, 3, map_size=8).state_dict()) == {
+        "linear.weight",
+        "linear.bias",
+    }
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"sigma_unit": "pixel"}, {"projector_axes": "image"}, {"sigma": 0.0}, {"coverage": -1.0}],
+)
+def test_errors(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        IcosahedralProjector(2, 3, map_size=8, **options)
+
+
+def test_wrong_map_is_refused():
+    with pytest.raises(ValueError, match="8×8"):
+        IcosahedralProjector(2, 3, map_size=8)(torch.zeros(1, 2, 9, 9))
+
+
+def test_weights_are_a_gaussian():
+    weights = sampling_weights(torch.tensor([[1.0, 2.5]]), 4, 0.7).view(4, 4)
+    row, column = 2, 1
+    distance = (row + 0.5 - 1.0) ** 2 + (column + 0.5 - 2.5) ** 2
+    nearest = (0.5 + 0.5 - 1.0 - 0.5) ** 2
+    ratio = weights[row, column] / weights[0, 2]
+    assert ratio.item() == pytest.approx(math.exp(-(distance - nearest) / (2 * 0.49)))
