@@ -1,0 +1,15 @@
+"""Lightning callbacks: pictures, error histograms, final metrics, guards, per-image records."""
+
+from i2i.callbacks.errors import ErrorHistogram
+from i2i.callbacks.guard import NonFiniteLossGuard
+from i2i.callbacks.hparams import HyperparameterMetrics
+from i2i.callbacks.images import PredictionImages
+from i2i.callbacks.record import PredictionRecord
+
+__all__ = [
+    "ErrorHistogram",
+    "HyperparameterMetrics",
+    "NonFiniteLossGuard",
+    "PredictionImages",
+    "PredictionRecord",
+]

@@ -1,0 +1,257 @@
+"""A trained network that answers for one picture: `i2i.load(run).predict("photo.png")`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from i2i.data.info import DataInfo
+from i2i.data.photographs import PreparedImage, prepare_photograph
+from i2i.data.pictures import Picture
+from i2i.errors import CheckpointError, ConfigurationError
+from i2i.geometry.cameras import Camera
+from i2i.geometry.rotations import (
+    euler_deg_from_rotation,
+    geodesic_angle_rad,
+    quaternion_xyzw_from_rotation,
+    z_axis_angle_rad,
+)
+from i2i.models.prediction import PosePrediction
+from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
+from i2i.rendering.mesh import RenderMesh
+from i2i.rendering.reference import load_mesh
+
+SAME_ANSWER_DEG = 15.0
+"""Candidates closer than this to a better one count as the same answer; their mass is added up."""
+
+_NUM_ALTERNATIVES = 3
+
+
+class Predictor:
+    """A network in evaluation mode with what is needed to feed it pictures and to draw its answers.
+
+    Args:
+        network: Maps a batch to a `PosePrediction` or a `ClassPrediction`.
+        info: What the network was trained on.
+        config: Resolved configuration of the run.
+        run_folder: Folder of the run; its ``reference_meshes/<class>.npz`` are used for drawing.
+        reference_meshes: Meshes by class name, instead of the run folder's.
+
+    Example:
+        >>> predictor = i2i.load("runs/chairs")  # doctest: +SKIP
+        >>> result = predictor.predict("chair.png", box=(40, 30, 220, 260))  # doctest: +SKIP
+        >>> result.rotation, result.confidence  # doctest: +SKIP
+        >>> result.draw("chair_pose.png")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        info: DataInfo,
+        *,
+        config: Mapping[str, Any] | None = None,
+        run_folder: str | Path | None = None,
+        reference_meshes: Mapping[str, RenderMesh] | None = None,
+    ) -> None:
+        self.network = network.eval()
+        self.info = info
+        self.config = dict(config or {})
+        self.run_folder = None if run_folder is None else Path(run_folder)
+        self._given_meshes = reference_meshes
+
+    def __repr__(self) -> str:
+        """Network, classes and input."""
+        return (
+            f"Predictor({type(self.network).__name__}, {', '.join(self.info.class_names)}; "
+            f"{self.info.modality}, {self.info.image_size} px)"
+        )
+
+    @cached_property
+    def reference_meshes(self) -> dict[str, RenderMesh]:
+        """Meshes for drawing, by class name; classes without one are left out."""
+        if self._given_meshes is not None:
+            return dict(self._given_meshes)
+        if self.run_folder is None:
+            return {}
+        paths = {
+            name: self.run_folder / "reference_meshes" / f"{name}.npz"
+            for name in self.info.class_names
+        }
+        return {name: load_mesh(path) for name, path in paths.items() if path.is_file()}
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network's weights are."""
+        first = next(self.network.parameters(), None)
+        return torch.device("cpu") if first is None else first.device
+
+    def predict(
+        self,
+        image: Picture,
+        *,
+        class_name: str | None = None,
+        mask: Picture | None = None,
+        box: Sequence[float] | None = None,
+        intrinsics: Sequence[float] | None = None,
+        margin: float = 1.0,
+    ) -> PoseResult | ClassResult:
+        """Say how the object in a picture is turned, or of which class it is.
+
+        Args:
+            image: Path, PIL image or array (H, W), (H, W, 1 | 3 | 4).
+            class_name: Class of the object; needed by a pose network of several classes.
+            mask: Picture of the same size, non-zero on the object; else the image's alpha is used.
+            box: (x0, y0, x1, y1) around the object in pixels.
+            intrinsics: (fx, fy, cx, cy) of the camera in pixels. With them the rotation is into
+                this camera's frame, without them into the frame of a camera that looks at the
+                middle of the crop.
+            margin: Factor on the side of the crop; above 1 the object becomes smaller.
+
+        Returns:
+            A `PoseResult` or a `ClassResult`, depending on the network.
+
+        Raises:
+            ImageError: if the picture cannot be read, or mask, box or intrinsics do not fit it.
+            ConfigurationError: if the class is unknown, or is needed and not given.
+            CheckpointError: if the network's answer is not finite.
+        """
+        if class_name is not None:
+            self._check_class(class_name)
+        prepared = prepare_photograph(
+            image, channels=self.info.channels, image_size=self.info.image_size,
+            background=self.info.background, mask=mask, box=box, intrinsics=intrinsics,
+            margin=margin,
+            camera=Camera(distance=self.info.camera_distance, fov_deg=self.info.camera_fov_deg),
+        )  # fmt: skip
+        batch = {"image": prepared.tensor.to(self.device)}
+        chosen = class_name or self.info.class_names[0]
+        batch["class_id"] = torch.tensor([self.info.class_names.index(chosen)], device=self.device)
+        with torch.inference_mode():
+            prediction = self.network(batch)
+        warnings = (*prepared.warnings, *self._modality_warnings())
+        if not isinstance(prediction, PosePrediction):
+            return self._class_result(prediction.logits, prepared, warnings)
+        if class_name is None and self.info.num_classes > 1:
+            raise ConfigurationError(
+                "This network was trained for several classes and looks at each with its own "
+                f"weights: add class_name=, one of {', '.join(self.info.class_names)}."
+            )
+        return self._pose_result(prediction, prepared, warnings, class_name=chosen)
+
+    def _check_class(self, class_name: str) -> None:
+        if class_name not in self.info.class_names:
+            raise ConfigurationError(
+                f"class_name={class_name!r} is unknown to this network. Allowed: "
+                f"{', '.join(self.info.class_names)}."
+            )
+
+    def _modality_warnings(self) -> tuple[str, ...]:
+        if self.info.modality != "depth":
+            return ()
+        return (
+            "The network was trained on depth images (near white, far black, background white), "
+            "not on photographs: give such a depth image.",
+        )
+
+    def _pose_result(
+        self,
+        prediction: PosePrediction,
+        prepared: PreparedImage,
+        warnings: tuple[str, ...],
+        *,
+        class_name: str,
+    ) -> PoseResult:
+        symmetry = self.info.symmetry[self.info.class_names.index(class_name)]
+        best = prediction.rotation[0].double().cpu()
+        _check_finite(best)
+        answers = _distinct_answers(prediction, best, symmetry=symmetry)
+        turn = torch.from_numpy(prepared.camera_from_crop)
+        rotation = turn @ best
+        return PoseResult(
+            class_name=class_name,
+            symmetry=symmetry,
+            rotation=rotation.numpy(),
+            quaternion_xyzw=quaternion_xyzw_from_rotation(rotation).numpy(),
+            euler_deg=euler_deg_from_rotation(rotation).numpy(),
+            confidence=answers[0][1] if answers else None,
+            alternatives=tuple(
+                Alternative(rotation=(turn @ other).numpy(), probability=probability)
+                for other, probability in answers[1 : 1 + _NUM_ALTERNATIVES]
+            ),
+            warnings=warnings,
+            crop_box=prepared.crop_box,
+            drawing=Drawing(
+                image=prepared.tensor[0].numpy(),
+                info=self.info,
+                mesh=self.reference_meshes.get(class_name),
+                camera_from_crop=prepared.camera_from_crop,
+            ),
+        )
+
+    def _class_result(
+        self, logits: Tensor, prepared: PreparedImage, warnings: tuple[str, ...]
+    ) -> ClassResult:
+        _check_finite(logits)
+        probabilities = torch.softmax(logits[0].double().cpu(), dim=0)
+        ranked = torch.argsort(probabilities, descending=True, stable=True).tolist()
+        names = self.info.class_names
+        return ClassResult(
+            class_name=names[ranked[0]],
+            confidence=float(probabilities[ranked[0]]),
+            probabilities={names[index]: float(probabilities[index]) for index in ranked},
+            warnings=warnings,
+            crop_box=prepared.crop_box,
+            drawing=Drawing(
+                image=prepared.tensor[0].numpy(), info=self.info, mesh=None,
+                camera_from_crop=np.eye(3),
+            ),
+        )  # fmt: skip
+
+
+def _check_finite(values: Tensor) -> None:
+    if not torch.isfinite(values).all():
+        raise CheckpointError(
+            "The network's answer is not a finite number: its weights are damaged or training "
+            "diverged. Use another checkpoint (ckpt=best), or train again with a lower lr."
+        )
+
+
+def _distinct_answers(
+    prediction: PosePrediction, best: Tensor, *, symmetry: str
+) -> list[tuple[Tensor, float]]:
+    """Different answers and their probability masses, the given best one first.
+
+    Several candidates may stand for one rotation (neighbouring group elements whose residuals
+    meet): each candidate's mass goes to the first answer within `SAME_ANSWER_DEG` of it, going
+    through the candidates from the most probable to the least. For a class with an axis of
+    symmetry, only the direction of the axis tells answers apart.
+
+    Returns:
+        Empty for a network without a distribution.
+    """
+    if prediction.log_prob is None or prediction.candidates is None:
+        return []
+    candidates = prediction.candidates.double().cpu()
+    candidates = candidates if candidates.ndim == 3 else candidates[0]  # (K, 3, 3)
+    mass = prediction.log_prob[0].double().exp().cpu()
+    angle = z_axis_angle_rad if symmetry == "z" else geodesic_angle_rad
+    answers, free = [], torch.ones(len(mass), dtype=torch.bool)
+    order = torch.argsort(mass, descending=True, stable=True).tolist()
+    centers = [best, *(candidates[index] for index in order)]
+    for number, center in enumerate(centers):
+        if number and not free[order[number - 1]]:
+            continue
+        same = free & (torch.rad2deg(angle(candidates, center.expand_as(candidates)))
+                       <= SAME_ANSWER_DEG)  # fmt: skip
+        answers.append((center, float(mass[same].sum())))
+        free &= ~same
+        if len(answers) > _NUM_ALTERNATIVES:
+            break
+    # The best stays first: it is what the network answers, even where merged masses rank higher.
+    return [answers[0], *sorted(answers[1:], key=lambda answer: -answer[1])]
