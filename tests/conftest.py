@@ -15,6 +15,7 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 @pytest.fixture(autouse=True)
 def _one_seed():
     torch.manual_seed(0)
+    torch.set_num_threads(1)  # two cores, and OpenMP waits in a busy loop
 
 
 @pytest.fixture(scope="session")
@@ -27,8 +28,12 @@ def door(tmp_path_factory):
     def run(name, *words, cwd, check=True, timeout=600):
         done = subprocess.run(
             [sys.executable, "-m", f"i2i.{name}", *words],
-            cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False,
-            env={**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "2"},
+            cwd=cwd,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+            env={**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1"},
         )
         assert not check or done.returncode == 0, f"{done.stdout}\n{done.stderr}"
         return done

@@ -99,7 +99,12 @@ def test_an_unknown_option_is_refused_with_the_list_of_what_there_is():
 
 @pytest.mark.parametrize(
     ("given", "expected"),
-    [("chair", "chair"), (["chair", "night stand"], "chair-night-stand"), ("a/b=c,d", "a-b-c-d"), ("", "none")],
+    [
+        ("chair", "chair"),
+        (["chair", "night stand"], "chair-night-stand"),
+        ("a/b=c,d", "a-b-c-d"),
+        ("", "none"),
+    ],
 )
 def test_slugs_hold_only_characters_that_hydra_accepts_unquoted(given, expected):
     assert slug(given) == expected

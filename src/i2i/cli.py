@@ -1,10 +1,12 @@
 """The shell around every door: Hydra on the outside, plain error messages on the way out."""
 
+import os
 import sys
 from collections.abc import Callable
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -17,7 +19,7 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
     """Make a command of a function that takes a configuration.
 
     Errors that a user can cause are printed without a traceback and end the process with status 1;
-    in a sweep they are handed to Hydra, which reports the job.
+    HYDRA_FULL_ERROR=1 shows the traceback. In a sweep they are handed to Hydra, which reports the job.
 
     Args:
         config_name: The YAML file at the top of `conf/` that belongs to the command.
@@ -28,8 +30,8 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
         def shell(cfg: DictConfig) -> None:
             try:
                 function(cfg)
-            except (I2IError, OmegaConfBaseException) as error:
-                if HydraConfig.get().mode == RunMode.MULTIRUN:
+            except (I2IError, ValueError, HydraException, OmegaConfBaseException) as error:
+                if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(f"error: {readable(error)}", file=sys.stderr)
                 sys.exit(1)
@@ -45,10 +47,10 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
 
 
 def readable(error: BaseException) -> str:
-    """The message of our own error inside what OmegaConf wrapped around it, if there is one."""
+    """The message of the error inside what Hydra and OmegaConf wrapped around it."""
     inner: BaseException | None = error
     while inner is not None:
-        if isinstance(inner, I2IError):
+        if isinstance(inner, I2IError) or (inner is not error and type(inner) is ValueError):
             return str(inner)
         inner = inner.__cause__
     if "Missing mandatory value" in str(error):
@@ -72,4 +74,6 @@ def refuse(overrides: list[str], *, allowed: tuple[str, ...], reason: str) -> No
     """
     bad = [o for o in overrides if not o.lstrip("+~").startswith(allowed)]
     if bad:
-        raise ConfigurationError(f"{reason}: leave out {' '.join(bad)} (allowed: {', '.join(allowed)})")
+        raise ConfigurationError(
+            f"{reason}: leave out {' '.join(bad)} (allowed: {', '.join(allowed)})"
+        )

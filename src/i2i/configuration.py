@@ -28,7 +28,9 @@ def config_dir() -> str:
     for candidate in (package / "conf", package.parents[1] / "conf"):
         if (candidate / "train.yaml").is_file():
             return str(candidate)
-    raise FileNotFoundError(f"no conf/train.yaml beside {package}: install i2i again, or use a clone")
+    raise FileNotFoundError(
+        f"no conf/train.yaml beside {package}: install i2i again, or use a clone"
+    )
 
 
 def compose(overrides: Sequence[str] = (), config_name: str = "train") -> DictConfig:

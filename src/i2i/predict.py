@@ -1,0 +1,67 @@
+"""Say how the object in a picture is turned: `python -m i2i.predict run=runs/<name> input=photo.png`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from i2i.cli import door
+from i2i.configuration import register_resolvers
+from i2i.errors import ImageError
+from i2i.runs.loading import load, locate
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+
+
+def predict(cfg: DictConfig) -> dict[str, Any]:
+    """Predict for one picture or each picture of a folder; writes a picture and a JSON for each.
+
+    Args:
+        cfg: The composed configuration of this door.
+
+    Returns:
+        For each input file its result, as `PoseResult` or `ClassResult` objects.
+
+    Raises:
+        ImageError: if there is no picture.
+    """
+    register_resolvers()
+    predictor = load(cfg.run, ckpt=cfg.ckpt, device=cfg.device)
+    folder, _ = locate(cfg.run, cfg.ckpt)
+    output = Path(cfg.output) if cfg.output else folder.path / "predictions"
+    output.mkdir(parents=True, exist_ok=True)
+    options = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(options, dict)
+    results: dict[str, Any] = {}
+    for path in _pictures(Path(cfg.input)):
+        result = predictor.predict(
+            path,
+            **{k: options[k] for k in ("class_name", "mask", "box", "intrinsics")},
+        )
+        result.draw(output / f"{path.stem}.png")
+        (output / f"{path.stem}.json").write_text(json.dumps(result.to_dict(), indent=1) + "\n")
+        print(f"{path}\n{result}\npicture {output / f'{path.stem}.png'}\n")
+        results[str(path)] = result
+    return results
+
+
+def _pictures(given: Path) -> list[Path]:
+    if given.is_dir():
+        found = sorted(p for p in given.iterdir() if p.suffix.lower() in PICTURES)
+        if not found:
+            raise ImageError(f"input={given}: no picture there ({', '.join(PICTURES)})")
+        return found
+    if not given.exists():
+        raise ImageError(f"input={given}: no such file; give a picture or a folder of pictures")
+    return [given]
+
+
+@door("predict")
+def main(cfg: DictConfig) -> None:
+    """Predict for a picture."""
+    predict(cfg)
+
+
+if __name__ == "__main__":
+    main()

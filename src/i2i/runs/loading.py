@@ -1,0 +1,119 @@
+"""The one way to load a checkpoint: read, check, build, load, and rebuild every cached kernel."""
+
+import pickle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from i2i.data.info import DataInfo
+from i2i.errors import CheckpointError
+from i2i.runs.building import build_task
+from i2i.runs.folder import RunFolder
+from i2i.tasks.base import CHECKPOINT_FORMAT, Task
+
+if TYPE_CHECKING:
+    from i2i.predictor import Predictor
+
+
+def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> "Predictor":
+    """Load a trained network for prediction.
+
+    Args:
+        run: A run folder, or a checkpoint file.
+        ckpt: `last` or `best`, when a folder is given.
+        device: Where the network goes.
+
+    Returns:
+        A predictor with `.predict(image)`.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, or one of another format.
+    """
+    from i2i.predictor import Predictor  # imports the drawing libraries, which training need not
+
+    folder, path = locate(run, ckpt)
+    task = load_task(path)
+    return Predictor(
+        task.network.to(device),
+        task.info,
+        config=task.run_config,
+        run_folder=folder.path,
+    )
+
+
+def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
+    """The run folder and the checkpoint file that a user means by `run`.
+
+    Raises:
+        CheckpointError: if there is neither.
+    """
+    path = Path(run)
+    if path.is_file():
+        return RunFolder(path.resolve().parent.parent), path
+    if not path.is_dir():
+        raise CheckpointError(
+            f"run={run}: no such run folder or checkpoint; `ls -t runs` shows the newest runs"
+        )
+    folder = RunFolder(path)
+    return folder, folder.checkpoint(ckpt)
+
+
+def load_task(path: Path) -> Task:
+    """Rebuild a task from a checkpoint alone, in evaluation mode, with the checkpoint's weights.
+
+    Raises:
+        CheckpointError: if the file is no checkpoint of ours, is damaged, or does not fit.
+    """
+    checkpoint = read_checkpoint(path)
+    ours = checkpoint["i2i"]
+    task = build_task(ours["config"], DataInfo.from_dict(ours["data"]))
+    load_weights(task, checkpoint, path)
+    # Passing through training mode throws away every kernel that was expanded from other weights.
+    task.train()
+    return task.eval()
+
+
+def load_weights(task: Task, checkpoint: dict[str, Any], path: Path) -> None:
+    """Put a checkpoint's weights into a task.
+
+    Raises:
+        CheckpointError: if names or shapes differ, for example for another number of classes.
+    """
+    try:
+        task.load_state_dict(checkpoint["state_dict"])
+    except RuntimeError as error:
+        classes = checkpoint["i2i"]["data"]["class_names"]
+        raise CheckpointError(
+            f"{path} does not fit this network: it was trained for {len(classes)} class(es) "
+            f"({', '.join(classes)}), the network is for {task.info.num_classes} "
+            f"({', '.join(task.info.class_names)}). {str(error).splitlines()[-1].strip()}. "
+            "Use the configuration of its own run folder: run=<folder>"
+        ) from error
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint without running any code that it might hold.
+
+    Raises:
+        CheckpointError: if it is not one of ours, of another format, or damaged.
+    """
+    try:
+        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, OSError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(
+            f"{path} cannot be read as a checkpoint ({first}). If it was cut short, use another: "
+            "ckpt=best or ckpt=last of its run folder"
+        ) from error
+    if not isinstance(checkpoint, dict) or "i2i" not in checkpoint:
+        raise CheckpointError(
+            f"{path} is not a checkpoint of i2i: use one that `python -m i2i.train` wrote"
+        )
+    found = checkpoint["i2i"].get("format")
+    if found != CHECKPOINT_FORMAT:
+        raise CheckpointError(
+            f"{path} has format {found}, this version of i2i reads format {CHECKPOINT_FORMAT}: "
+            "install the version named in the run's versions.json, or train again"
+        )
+    return checkpoint

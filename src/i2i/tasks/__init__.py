@@ -1,0 +1,1 @@
+"""LightningModules: they run a network's loss, metrics and optimiser, nothing else."""

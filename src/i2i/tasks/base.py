@@ -1,0 +1,134 @@
+"""What the tasks share: one step for all stages, the optimiser, and where the metrics go."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from i2i.data.info import DataInfo
+
+Batch = dict[str, Tensor]
+
+CHECKPOINT_FORMAT = 1
+"""Of what i2i adds to a checkpoint; raised whenever an older version could not read it."""
+
+
+class Task(LightningModule):
+    """Runs a network, its loss, its metrics and its optimiser; nothing else.
+
+    The network maps a batch to a prediction and `network.loss(prediction, batch)` to a dict of
+    named terms that are already weighted; the task adds them up. Validation and test steps return
+    `{"prediction": ..., "batch": ..., ...}`, which is what callbacks draw and write.
+
+    Args:
+        network: The network, called with a batch.
+        optimizer: Makes an optimiser from the network's parameters.
+        scheduler: Makes a learning-rate scheduler from the optimiser; None keeps the rate.
+        scheduler_interval: `"step"` or `"epoch"`: when the scheduler moves.
+        info: What the data are.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        optimizer: Callable[..., Optimizer],
+        scheduler: Callable[..., LRScheduler] | None,
+        scheduler_interval: str,
+        info: DataInfo,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.info = info
+        self.make_optimizer = optimizer
+        self.make_scheduler = scheduler
+        self.scheduler_interval = scheduler_interval
+        self.run_config: dict[str, Any] = {}
+
+    def forward(self, batch: Batch) -> Any:  # noqa: ANN401 - the prediction type is the task's
+        """The network's prediction for a batch."""
+        return self.network(batch)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Loss of one batch, logged with its terms."""
+        terms = self.network.loss(self.network(batch), batch)  # type: ignore[operator]
+        loss = torch.stack(list(terms.values())).sum()
+        size = len(batch["image"])
+        self.log("train/loss", loss, prog_bar=True, batch_size=size)
+        self.log_dict({f"train/loss_{k}": v for k, v in terms.items()}, batch_size=size)
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Predict, log the loss, feed the metrics."""
+        return self._evaluation_step(batch, "val")
+
+    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Predict, log the loss, feed the metrics."""
+        return self._evaluation_step(batch, "test")
+
+    def _evaluation_step(self, batch: Batch, stage: str) -> dict[str, Any]:
+        prediction = self.network(batch)
+        terms = self.network.loss(prediction, batch)  # type: ignore[operator]
+        loss = torch.stack(list(terms.values())).sum()
+        self.log(
+            f"{stage}/loss",
+            loss,
+            on_step=False,
+            on_epoch=True,
+            sync_dist=True,
+            batch_size=len(batch["image"]),
+        )
+        more = self.update_metrics(stage, prediction, batch)
+        return {"prediction": prediction, "batch": batch, **more}
+
+    def on_validation_epoch_end(self) -> None:
+        """Log what the validation images gave."""
+        self._log_metrics("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Log what the test images gave."""
+        self._log_metrics("test")
+
+    def _log_metrics(self, stage: str) -> None:
+        values = self.compute_metrics(stage)
+        self.log_dict({f"{stage}/{name}": value for name, value in values.items()}, sync_dist=False)
+
+    def update_metrics(
+        self,
+        stage: str,
+        prediction: Any,
+        batch: Batch,  # noqa: ANN401 - the task's own type
+    ) -> dict[str, Tensor]:
+        """Add a batch to the metrics of a stage (`"val"` or `"test"`).
+
+        Returns:
+            What the step hands on to callbacks beside prediction and batch, by name.
+        """
+        raise NotImplementedError
+
+    def compute_metrics(self, stage: str) -> dict[str, Tensor]:
+        """Values of a stage's metrics by name, reduced over processes; resets them."""
+        raise NotImplementedError
+
+    def configure_optimizers(self) -> Any:  # noqa: ANN401 - one of Lightning's many forms
+        """The optimiser, and its scheduler if there is one."""
+        optimizer = self.make_optimizer(self.network.parameters())
+        if self.make_scheduler is None:
+            return optimizer
+        scheduler = self.make_scheduler(optimizer)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": self.scheduler_interval},
+        }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Put plain data into the checkpoint, enough to rebuild the task from it alone."""
+        checkpoint["i2i"] = {
+            "format": CHECKPOINT_FORMAT,
+            "config": self.run_config,
+            "data": self.info.to_dict(),
+        }

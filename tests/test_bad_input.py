@@ -1,0 +1,127 @@
+"""What a user gets for a mistake: what was given, what is allowed, what to type next; no traceback."""
+
+import numpy as np
+import pytest
+import torch
+
+from i2i.configuration import compose
+from i2i.data.info import DataInfo
+from i2i.errors import CheckpointError, ConfigurationError
+from i2i.runs.building import build_datamodule, build_network, build_task, check_fit
+from i2i.runs.loading import load_task, load_weights, locate, read_checkpoint
+
+TINY = ["scale=tiny", "trainer.accelerator=cpu"]
+
+
+@pytest.mark.parametrize(
+    ("door_name", "words", "expected"),
+    [
+        ("train", ["data.object=cahir"], ["cahir", "chair"]),
+        ("train", ["data=modelnet40"], ["i2i.download", "modelnet40"]),
+        ("train", ["data=shapenet_bed"], ["shapenet", "register"]),
+        ("train", ["data=meshes"], ["data.root"]),
+        ("train", ["data=meshes", "data.root=nowhere"], ["nowhere"]),
+        ("train", ["data.modality=infrared"], ["infrared", "gray"]),
+        ("train", ["model.label_frame=wrong"], ["consistent", "reference"]),
+        ("train", ["resume=runs/nothing"], ["runs/nothing"]),
+        ("predict", ["run=runs/nothing", "input=a.png"], ["runs/nothing", "ls -t runs"]),
+        ("evaluate", ["run=runs/nothing"], ["runs/nothing"]),
+        ("predict", ["input=a.png"], ["run"]),
+    ],
+)
+def test_a_mistake_gets_a_message_and_not_a_traceback(door, tmp_path, door_name, words, expected):
+    done = door(
+        door_name, *(TINY if door_name == "train" else []), *words, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    for word in expected:
+        assert word.lower() in done.stderr.lower(), done.stderr
+
+
+def test_a_task_that_the_model_cannot_do_is_refused_with_what_it_can():
+    config = compose([*TINY, "~model.networks.classification", "task=classification"])
+    with pytest.raises(ConfigurationError, match="task=pose"):
+        check_fit(config)
+
+
+def test_a_modality_that_the_model_does_not_see_is_refused():
+    config = compose([*TINY, "model.modalities=[depth]"])
+    with pytest.raises(ConfigurationError, match=r"data\.modality=depth"):
+        build_datamodule(config)
+
+
+def info(classes: int) -> DataInfo:
+    names = tuple(f"class{i}" for i in range(classes))
+    return DataInfo(names, ("none",) * classes, channels=1, image_size=32, modality="gray")
+
+
+def checkpoint_of(classes: int, path) -> None:
+    config = compose(TINY)
+    task = build_task(config, info(classes))
+    content: dict = {"state_dict": task.state_dict()}
+    task.on_save_checkpoint(content)
+    torch.save(content, path)
+
+
+def test_weights_for_another_number_of_classes_are_refused(tmp_path):
+    path = tmp_path / "two.ckpt"
+    checkpoint_of(2, path)
+    three = build_task(compose(TINY), info(3))
+    with pytest.raises(CheckpointError, match="trained for 2 class"):
+        load_weights(three, read_checkpoint(path), path)
+
+
+def test_checkpoints_of_another_format_or_origin_or_cut_short_are_refused(tmp_path):
+    path = tmp_path / "a.ckpt"
+    checkpoint_of(1, path)
+    whole = path.read_bytes()
+    content = torch.load(path, weights_only=True)
+    content["i2i"]["format"] = 99
+    torch.save(content, path)
+    with pytest.raises(CheckpointError, match="format 99"):
+        load_task(path)
+    torch.save({"state_dict": {}}, path)
+    with pytest.raises(CheckpointError, match="not a checkpoint of i2i"):
+        load_task(path)
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        load_task(path)
+    with pytest.raises(CheckpointError, match="no checkpoint yet"):
+        locate(tmp_path)
+
+
+def test_a_checkpoint_that_holds_code_is_not_run(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (print, ("boom",))
+
+    torch.save({"i2i": Bomb()}, tmp_path / "bad.ckpt")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        read_checkpoint(tmp_path / "bad.ckpt")
+
+
+def test_a_loaded_network_predicts_as_the_saved_one_whatever_mode_it_was_saved_in(tmp_path):
+    config = compose(TINY)
+    task = build_task(config, info(1))
+    batch = {"image": torch.rand(4, 1, 32, 32), "class_id": torch.zeros(4, dtype=torch.int64)}
+    for mode in (True, False):
+        task.train(mode)
+        with torch.no_grad():
+            for parameter in task.network.parameters():
+                parameter.add_(0.01 * torch.randn_like(parameter))
+        content: dict = {"state_dict": task.state_dict()}
+        task.on_save_checkpoint(content)
+        torch.save(content, tmp_path / "x.ckpt")
+        loaded = load_task(tmp_path / "x.ckpt")
+        task.train()
+        task.eval()
+        expected = task.network(batch).logits
+        np.testing.assert_allclose(
+            loaded.network(batch).logits.detach(), expected.detach(), atol=1e-6
+        )
+
+
+def test_networks_build_from_configuration_for_any_number_of_channels_and_classes():
+    network = build_network(compose([*TINY, "data.modality=rgb"]), info(3))
+    assert sum(p.numel() for p in network.parameters()) > 0

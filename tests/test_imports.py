@@ -1,0 +1,55 @@
+"""Who may import whom: the layers of the package hold."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "i2i"
+SHARED = {"errors", "i2i"}  # may be imported by everybody
+DOORS = {"train", "evaluate", "predict", "render", "download"}
+ALLOWED = {
+    "geometry": set(),
+    "nn": {"geometry"},
+    "metrics": {"geometry"},
+    "rendering": {"geometry"},
+    "testing": {"geometry"},
+    "models": {"nn", "geometry"},
+    "data": {"geometry", "rendering"},
+    "tasks": {"models", "nn", "metrics", "data.info"},
+    "runs": {
+        "tasks", "data", "models", "metrics", "rendering",
+        "predictor", "viz", "callbacks",  # the loader hands out a predictor, the results are drawn
+    },
+}  # fmt: skip
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of i2i that a file imports, as `data.info` for i2i.data.info."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        found |= {n.removeprefix("i2i.") for n in names if n == "i2i" or n.startswith("i2i.")}
+    return found
+
+
+@pytest.mark.parametrize("layer", sorted(ALLOWED))
+def test_a_layer_imports_only_what_lies_below_it(layer):
+    for path in (PACKAGE / layer).rglob("*.py"):
+        for name in imports(path):
+            top = name.split(".")[0]
+            allowed = ALLOWED[layer] | SHARED | {layer}
+            assert top in allowed or name in allowed, f"{path} imports i2i.{name}"
+
+
+def test_nothing_imports_a_door():
+    for path in PACKAGE.rglob("*.py"):
+        assert not {n.split(".")[0] for n in imports(path)} & DOORS, path
+
+
+def test_rendering_processes_do_not_import_torch_through_the_package_root():
+    assert "torch" not in (PACKAGE / "__init__.py").read_text().split('"""')[2].split("def ")[0]
