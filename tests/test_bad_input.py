@@ -1,4 +1,4 @@
-"""What a user gets for a mistake: what was given, what is allowed, what to type next; no traceback."""
+"""What a user gets for a mistake: what was given, what is allowed, what to type; no traceback."""
 
 import numpy as np
 import pytest

@@ -19,7 +19,7 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
     """Make a command of a function that takes a configuration.
 
     Errors that a user can cause are printed without a traceback and end the process with status 1;
-    HYDRA_FULL_ERROR=1 shows the traceback. In a sweep they are handed to Hydra, which reports the job.
+    HYDRA_FULL_ERROR=1 shows the traceback. In a sweep Hydra reports the job.
 
     Args:
         config_name: The YAML file at the top of `conf/` that belongs to the command.

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def compose(overrides: Sequence[str] = (), config_name: str = "train") -> DictCo
 
 def register_resolvers() -> None:
     """Make the resolvers of the YAML files known to OmegaConf; calling it again changes nothing."""
-    for name, function in {
+    resolvers: dict[str, Callable[..., Any]] = {
         "i2i.label_frame": _label_frame,
         "i2i.slug": slug,
         "i2i.started": lambda: _STARTED,
@@ -60,7 +60,8 @@ def register_resolvers() -> None:
         "i2i.coverage": _coverage,
         "i2i.channels": _channels,
         "i2i.run_dir": _run_dir,
-    }.items():
+    }
+    for name, function in resolvers.items():
         OmegaConf.register_new_resolver(name, function, replace=True)
 
 
@@ -74,7 +75,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def slug(value: object) -> str:
     """A value as part of a file name: letters, digits, `.`, `_` and `-`;."""
     if OmegaConf.is_config(value):
-        value = OmegaConf.to_container(value)  # type: ignore[arg-type]
+        value = OmegaConf.to_container(value)
     text = "-".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
     return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-") or "none"
 

@@ -1,4 +1,4 @@
-"""Errors that a user can cause. Each message names what was given, what is allowed and what to type next."""
+"""Errors that a user can cause; each says what was given, what is allowed, what to type next."""
 
 
 class I2IError(Exception):

@@ -1,4 +1,4 @@
-"""Say how the object in a picture is turned: `python -m i2i.predict run=runs/<name> input=photo.png`."""
+"""How the object in a picture is turned: `python -m i2i.predict run=... input=photo.png`."""
 
 import json
 from pathlib import Path

@@ -1,9 +1,11 @@
-"""Render the views of a dataset into its store: `python -m i2i.render data=meshes data.root=my_parts`."""
+"""Render a dataset into its store: `python -m i2i.render data=meshes data.root=my_parts`."""
 
 from omegaconf import DictConfig
 
 from i2i.cli import door
 from i2i.configuration import register_resolvers
+from i2i.data.datamodule import RenderedDataModule
+from i2i.errors import ConfigurationError
 from i2i.runs.building import build_datamodule
 
 
@@ -18,6 +20,8 @@ def render(cfg: DictConfig) -> list[str]:
     """
     register_resolvers()
     datamodule = build_datamodule(cfg)
+    if not isinstance(datamodule, RenderedDataModule):
+        raise ConfigurationError(f"data={cfg.data.name} has no meshes: there is nothing to render")
     return [str(path) for path in datamodule.render(overwrite=cfg.overwrite).values()]
 
 

@@ -12,12 +12,13 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
-from lightning import Callback, LightningDataModule, Trainer, seed_everything
+from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from i2i.cli import door, given_overrides, refuse
 from i2i.configuration import plain, register_resolvers
+from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError
 from i2i.runs.building import build_datamodule, build_task
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
@@ -46,7 +47,7 @@ class RunResult:
     metrics: dict[str, float]
     run_dir: Path
     task: Task
-    datamodule: LightningDataModule
+    datamodule: ImageDataModule
 
 
 def train(cfg: DictConfig) -> RunResult:
@@ -90,7 +91,7 @@ def _run_dir(cfg: DictConfig) -> Path:
 
 
 def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
-    """The saved configuration of the run to go on with, and from the new one only what may change."""
+    """The saved configuration of the run to go on with, and of the new one what may change."""
     refuse(
         given_overrides(),
         allowed=_WITH_RESUME,
@@ -151,7 +152,7 @@ def _open(folder: RunFolder, config: dict[str, Any], identity: str, *, resumed: 
 
 
 def _run_stages(
-    cfg: DictConfig, folder: RunFolder, trainer: Trainer, task: Task, data: LightningDataModule
+    cfg: DictConfig, folder: RunFolder, trainer: Trainer, task: Task, data: ImageDataModule
 ) -> None:
     last = folder.checkpoints / "last.ckpt"
     if "fit" in cfg.run:

@@ -38,7 +38,9 @@ class PredictionRecord(Callback):
     ) -> None:  # fmt: skip
         """Keep a batch's predictions on the CPU."""
         prediction = outputs["prediction"]
-        kept = {k: batch[k] for k in ("class_id", "instance_id", "view_id") if k in batch}
+        kept: dict[str, Tensor] = {}
+        for name in ("class_id", "instance_id", "view_id"):
+            kept[name] = batch[name]
         if isinstance(prediction, PosePrediction):
             kept["rotation_true"] = batch["rotation"]
             kept["rotation_pred"] = prediction.rotation

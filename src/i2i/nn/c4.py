@@ -224,13 +224,13 @@ class C4Conv(R2Conv):
         return self._cache[1]
 
     def _convolve(self, x: Tensor, kernel: Tensor) -> Tensor:
-        """The convolution proper, without the bias: spectral where that was measured to be faster."""
+        """The convolution proper, without the bias; spectral where that is faster."""
         if self._is_spectral(x):
             return spectral_conv2d(x, kernel)
         return nn.functional.conv2d(x, kernel, stride=self.stride, padding=self.padding)
 
     def _is_spectral(self, x: Tensor) -> bool:
-        """Whether the spectral form applies to this layer and this input, and pays (docs/c4_spectral.md)."""
+        """Whether the spectral form applies here, and pays (docs/c4_spectral.md)."""
         square = x.shape[-1] == x.shape[-2]
         if not (self.training and self.is_regular and square) or _is_traced():
             return False

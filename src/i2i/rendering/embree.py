@@ -143,7 +143,8 @@ def _smoothed(
     hits = scene.cast(directions, rotation, rays.camera.distance)
     values = np.full((CHANNELS[modality], len(directions)), BACKGROUND, dtype=np.float32)
     values[:, hits.ray] = scene.picture_values(hits, modality, rays.pixel_width)
-    mean: NDArray[np.float32] = values.reshape(len(values), len(pixel), -1).mean(axis=-1)
+    samples = len(directions) // max(len(pixel), 1)  # not -1: a view can be without edge pixels
+    mean: NDArray[np.float32] = values.reshape(len(values), len(pixel), samples).mean(axis=-1)
     return mean
 
 

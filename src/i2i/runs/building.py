@@ -1,20 +1,21 @@
-"""From configuration to objects: data module, network, task. Training and loading both come here."""
+"""From configuration to objects: data module, network, task; training and loading come here."""
 
 from typing import Any
 
 from hydra.utils import instantiate
-from lightning import LightningDataModule
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from i2i.configuration import plain
 from i2i.data.info import DataInfo
+from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError
 from i2i.tasks.base import Task
 
 Config = DictConfig | dict[str, Any]
 
 
-def build_datamodule(config: Config) -> LightningDataModule:
+def build_datamodule(config: Config) -> ImageDataModule:
     """The data module of a configuration; nothing is read or rendered yet.
 
     Raises:
@@ -26,7 +27,8 @@ def build_datamodule(config: Config) -> LightningDataModule:
     settings = {k: v for k, v in config.data.items_ex(resolve=False) if k not in left_out}
     data = OmegaConf.create(settings)
     data._set_parent(config)  # interpolations go on pointing into the whole configuration
-    return instantiate(data, _convert_="all")
+    made: ImageDataModule = instantiate(data, _convert_="all")
+    return made
 
 
 def build_task(config: Config, info: DataInfo) -> Task:
@@ -50,19 +52,20 @@ def build_task(config: Config, info: DataInfo) -> Task:
     network = build_network(config, info)
     # As a partial: Hydra would turn a dataclass among its arguments into a config.
     task: Task = instantiate(node, _partial_=True)(network, info=info)
-    task.run_config = OmegaConf.to_container(config, resolve=True)
+    task.run_config = plain(config)
     return task
 
 
 def build_network(config: Config, info: DataInfo) -> nn.Module:
     """The network of a configuration for its task, with fresh weights."""
     config = _as_config(config)
-    return instantiate(
+    network: nn.Module = instantiate(
         config.model.networks[config.task.name],
         channels=info.channels,
         num_classes=info.num_classes,
         image_size=info.image_size,
     )
+    return network
 
 
 def check_fit(config: DictConfig) -> None:

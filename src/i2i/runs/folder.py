@@ -1,4 +1,4 @@
-"""A run's folder: which file is where, and small files that are written all at once or not at all."""
+"""A run's folder: which file is where, and small files written all at once or not at all."""
 
 import json
 import os
@@ -79,7 +79,7 @@ class RunFolder:
         return path
 
     def write_status(self, state: str, **more: Any) -> None:  # noqa: ANN401 - JSON values
-        """Record the state (`running`, `done`, `interrupted`, `failed`) and whatever goes with it."""
+        """Record the state (`running`, `done`, `interrupted`, `failed`) and what goes with it."""
         status = read_json(self.status) if self.status.exists() else {}
         status.update(state=state, updated=time.strftime("%Y-%m-%dT%H:%M:%S%z"), **more)
         write_json(self.status, status)

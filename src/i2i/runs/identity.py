@@ -6,7 +6,8 @@ from typing import Any
 
 # Where things lie, how they are shown, and on what they run: not part of what a job computes.
 _LEFT_OUT = (
-    "paths", "hydra", "logger", "callbacks", "run_name", "run_dir", "label", "resume", "print_config", "run",
+    "paths", "hydra", "logger", "callbacks", "run_name", "run_dir", "label", "resume",
+    "print_config", "run",
 )  # fmt: skip
 _LEFT_OUT_OF_DATA = (
     "root", "store_root", "num_workers", "render_workers", "eval_batch_size", "strict",

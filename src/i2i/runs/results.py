@@ -1,4 +1,4 @@
-"""What a finished run says: metrics with intervals, figures, and the small JSON that tables are made from.
+"""What a finished run says: metrics with intervals, figures, and the JSON that tables come from.
 
 `python -m i2i.runs.results [folder]` prints the table of the published results.
 """
@@ -6,16 +6,18 @@
 import json
 import sys
 from collections import defaultdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning import LightningDataModule, Trainer
+from lightning import Callback, Trainer
 from torch import Tensor
 
 from i2i.callbacks.record import PredictionRecord
 from i2i.data.info import DataInfo
+from i2i.data.loaders import ImageDataModule
 from i2i.metrics.bootstrap import Interval, instance_bootstrap
 from i2i.metrics.retrieval import RetrievalMAP
 from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, axis_error_deg, pose_scores
@@ -37,7 +39,7 @@ def summarise(arrays: Arrays, info: DataInfo, *, retrieval_samples: int = 20_000
 
     Returns:
         `metrics` by name, `intervals` by name as [low, high], `instances` and `images`, and
-        `errors_deg` (pose; a list for each instance) or `correct` (classification; a fraction each).
+        `errors_deg` (pose; a list for each instance) or `correct` (classification; one fraction).
     """
     instance = torch.from_numpy(arrays["instance_id"])
     counts = {"instances": len(instance.unique()), "images": len(instance)}
@@ -110,10 +112,10 @@ def finish(
     Returns:
         Final metrics by name, `test/...`; empty where no test was run.
     """
-    record = next((c for c in trainer.callbacks if isinstance(c, PredictionRecord)), None)
+    record = next((c for c in _callbacks(trainer) if isinstance(c, PredictionRecord)), None)
     if not trainer.is_global_zero:
         return {}
-    datamodule: LightningDataModule = trainer.datamodule  # type: ignore[attr-defined]
+    datamodule: ImageDataModule = trainer.datamodule  # type: ignore[attr-defined]
     save_reference_meshes(folder, task.info, datamodule)
     if record is None or not record.arrays:
         folder.write_status("done")
@@ -138,6 +140,11 @@ def finish(
         )
     folder.write_status("done")
     return {f"test/{name}": value for name, value in summary["metrics"].items()}
+
+
+def _callbacks(trainer: Trainer) -> list[Callback]:
+    found: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    return found
 
 
 def describe(config: dict[str, Any]) -> dict[str, Any]:
@@ -168,9 +175,7 @@ def _file_name(config: dict[str, Any], identity: str) -> str:
     return f"{job['model']}-{job['data']}-{object_name}-{job['scale']}-{identity}"
 
 
-def save_reference_meshes(
-    folder: RunFolder, info: DataInfo, datamodule: LightningDataModule
-) -> None:
+def save_reference_meshes(folder: RunFolder, info: DataInfo, datamodule: ImageDataModule) -> None:
     """Keep one decimated mesh of each class, so that predictions can be drawn without the data."""
     for name in info.class_names:
         path = folder.reference_meshes / f"{name}.npz"
@@ -180,7 +185,7 @@ def save_reference_meshes(
             save_mesh(decimate_mesh(mesh), path)
 
 
-def draw(folder: RunFolder, arrays: Arrays, task: Task, datamodule: LightningDataModule) -> None:
+def draw(folder: RunFolder, arrays: Arrays, task: Task, datamodule: ImageDataModule) -> None:
     """Write the figures of a test: errors, and a grid of predictions."""
     from i2i.viz.results import result_figures
     from i2i.viz.style import save_figure
@@ -210,8 +215,11 @@ def table(results: list[dict[str, Any]]) -> str:
         "|---|--:|--:|--:|--:|--:|--:|",
     ]
     for (label, views), members in rows.items():
-        pooled = [sum(lists, []) for lists in zip(*(m["errors_deg"] for m in members), strict=True)]
-        errors = torch.tensor(sum(pooled, []), dtype=torch.float64)
+        pooled = [
+            list(chain.from_iterable(lists))
+            for lists in zip(*(m["errors_deg"] for m in members), strict=True)
+        ]
+        errors = torch.tensor(list(chain.from_iterable(pooled)), dtype=torch.float64)
         instance = torch.tensor([i for i, e in enumerate(pooled) for _ in e])
         cells = [_cell(instance_bootstrap(errors, instance), 1)]
         for limit in ACCURACY_DEG:

@@ -100,8 +100,8 @@ class Task(LightningModule):
     def update_metrics(
         self,
         stage: str,
-        prediction: Any,
-        batch: Batch,  # noqa: ANN401 - the task's own type
+        prediction: Any,  # noqa: ANN401 - the task's own type
+        batch: Batch,
     ) -> dict[str, Tensor]:
         """Add a batch to the metrics of a stage (`"val"` or `"test"`).
 

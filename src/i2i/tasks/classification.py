@@ -28,11 +28,16 @@ class ClassificationTask(Task):
         )
         self.retrieval = RetrievalMAP()
 
+    def _accuracy(self, stage: str) -> ClassAccuracy:
+        metric = self.accuracy[stage]
+        assert isinstance(metric, ClassAccuracy)
+        return metric
+
     def update_metrics(
         self, stage: str, prediction: ClassPrediction, batch: Batch
     ) -> dict[str, Tensor]:
         """Add the scores of a batch."""
-        self.accuracy[stage].update(prediction.logits, batch["class_id"])
+        self._accuracy(stage).update(prediction.logits, batch["class_id"])
         if stage == "test":
             self.retrieval.update(
                 prediction.logits, prediction.descriptor, batch["class_id"], batch["instance_id"]
@@ -41,8 +46,8 @@ class ClassificationTask(Task):
 
     def compute_metrics(self, stage: str) -> dict[str, Tensor]:
         """Scores of a stage; resets them."""
-        values: dict[str, Tensor] = self.accuracy[stage].compute()
-        self.accuracy[stage].reset()
+        values: dict[str, Tensor] = self._accuracy(stage).compute()
+        self._accuracy(stage).reset()
         if stage == "test":
             values |= self.retrieval.compute()
             self.retrieval.reset()
