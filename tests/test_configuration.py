@@ -33,9 +33,12 @@ def test_every_option_of_a_group_composes(group):
         plain(compose([word.replace("+", "")]))
 
 
-@pytest.mark.parametrize("door", ["render", "evaluate", "predict", "download"])
-def test_every_door_composes(door):
-    assert compose([], door)
+@pytest.mark.parametrize(
+    ("door", "words"),
+    [("render", []), ("evaluate", []), ("predict", []), ("download", ["data=modelnet40"])],
+)
+def test_every_door_composes(door, words):
+    assert compose(words, door)
 
 
 def test_every_file_opens_with_what_it_is_and_the_command_that_uses_it():

@@ -16,7 +16,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.path import Path as MarkerPath
 
-from i2i.viz.style import HEAT, INK, VERMILLION, ImageArray, new_figure, to_numpy
+from i2i.viz.style import HEAT, INK, VERMILION, ImageArray, new_figure, to_numpy
 
 _SECTOR_DEG = 72.0
 _POLE = 1.0 - 1e-9
@@ -135,10 +135,10 @@ def _draw_table(
             "s",
             markersize=13,
             markerfacecolor="none",
-            markeredgecolor=VERMILLION,
+            markeredgecolor=VERMILION,
             markeredgewidth=2,
         )
-        axes.set_title("red: true element", fontsize=9, color=VERMILLION)
+        axes.set_title("red: true element", fontsize=9, color=VERMILION)
 
 
 def _draw_map(
@@ -157,7 +157,7 @@ def _draw_map(
             s=900,
             marker=sector,
             color=color_map.to_rgba(mass[element]),
-            edgecolor=VERMILLION if chosen else "white",
+            edgecolor=VERMILION if chosen else "white",
             linewidth=2.0 if chosen else 0.5,
             zorder=4 if chosen else 3,
             clip_on=False,

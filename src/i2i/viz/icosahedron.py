@@ -17,7 +17,7 @@ from i2i.viz.style import (
     HEAT,
     INK,
     ORANGE,
-    VERMILLION,
+    VERMILION,
     ImageArray,
     new_figure,
     show_image,
@@ -94,13 +94,13 @@ def projection_figure(
     pixels = to_numpy(image)
     show_image(left, pixels, title="image and the projected vertices")
     scale = pixels.shape[-1] / size
-    left.plot(*(spots.T * scale - 0.5), ".", color=VERMILLION, markersize=7)
+    left.plot(*(spots.T * scale - 0.5), ".", color=VERMILION, markersize=7)
     drawn = middle.imshow(norms, cmap=HEAT, extent=(0, size, size, 0), interpolation="nearest")
     middle.plot(
         *spots.T,
         "o",
         markerfacecolor="none",
-        markeredgecolor=VERMILLION,
+        markeredgecolor=VERMILION,
         markeredgewidth=1.5,
         markersize=8,
     )

@@ -12,7 +12,7 @@ from i2i.viz.style import (
     GRAY,
     INK,
     SKY,
-    VERMILLION,
+    VERMILION,
     ImageArray,
     new_figure,
     plain_axes,
@@ -111,4 +111,4 @@ def _write_warnings(figure: Figure, warnings: Sequence[str]) -> None:
         return
     width = int(figure.get_size_inches()[0] * 15)
     text = "\n".join(textwrap.fill(f"Warning: {sentence}", width) for sentence in warnings)
-    figure.supxlabel(text, fontsize=8, color=VERMILLION, ha="left", x=0.01)
+    figure.supxlabel(text, fontsize=8, color=VERMILION, ha="left", x=0.01)

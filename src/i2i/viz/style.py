@@ -14,9 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 # The palette of Okabe and Ito.
-BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GRAY, INK = "#CC79A7", "#56B4E9", "#7F7F7F", "#222222"
-CYCLE = (BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, GRAY)
+CYCLE = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GRAY)
 
 HEAT = "cividis"
 """Colour map of probabilities: reads the same with every kind of colour vision."""
@@ -53,10 +53,10 @@ def show_image(axes: Axes, image: ImageArray, *, title: str = "", color: str = I
 
 
 def error_color(error_deg: float) -> str:
-    """Green within 15°, orange within 30°, vermillion beyond."""
+    """Green within 15°, orange within 30°, vermilion beyond."""
     if error_deg <= 15.0:
         return GREEN
-    return ORANGE if error_deg <= 30.0 else VERMILLION
+    return ORANGE if error_deg <= 30.0 else VERMILION
 
 
 def figure_to_array(figure: Figure) -> np.ndarray:
