@@ -29,7 +29,7 @@ demo: $(VENV)/.installed
 	$(PY) -m i2i.train experiment=demo
 
 test: $(VENV)/.installed-dev
-	$(PY) -m pytest
+	$(PY) -m pytest -n auto --dist loadfile
 
 lint: $(VENV)/.installed-dev
 	$(PY) -m ruff check .

@@ -1,14 +1,20 @@
 """What a user gets for a mistake: what was given, what is allowed, what to type; no traceback."""
 
+import errno
+import json
+
 import numpy as np
 import pytest
 import torch
+from omegaconf import open_dict
 
 from i2i.configuration import compose
 from i2i.data.info import DataInfo
-from i2i.errors import CheckpointError, ConfigurationError
+from i2i.errors import CheckpointError, ConfigurationError, NonFiniteLossError
+from i2i.evaluate import evaluate
 from i2i.runs.building import build_datamodule, build_network, build_task, check_fit
 from i2i.runs.loading import load_task, load_weights, locate, read_checkpoint
+from i2i.train import train
 
 TINY = ["scale=tiny", "trainer.accelerator=cpu"]
 
@@ -125,3 +131,97 @@ def test_a_loaded_network_predicts_as_the_saved_one_whatever_mode_it_was_saved_i
 def test_networks_build_from_configuration_for_any_number_of_channels_and_classes():
     network = build_network(compose([*TINY, "data.modality=rgb"]), info(3))
     assert sum(p.numel() for p in network.parameters()) > 0
+
+
+def tiny_run(tmp_path, *words):
+    return compose(
+        [
+            *TINY,
+            "data.source.instances_per_class=4",
+            "data.source.test_instances_per_class=2",
+            "data.views_per_instance=8",
+            "data.test_views_per_instance=2",
+            "data.render_workers=0",
+            "trainer.enable_progress_bar=false",
+            "callbacks.images=null",
+            f"paths.data_dir={tmp_path}/data",
+            f"run_dir={tmp_path}/run",
+            *words,
+        ]
+    )
+
+
+@pytest.fixture
+def breaks_at_step(monkeypatch):
+    """Makes the task do something else than its training step at a step."""
+    from i2i.tasks.pose import PoseTask
+
+    def install(step, action):
+        original = PoseTask.training_step
+
+        def training_step(self, batch, batch_idx):
+            loss = original(self, batch, batch_idx)
+            return action(loss) if self.global_step == step else loss
+
+        monkeypatch.setattr(PoseTask, "training_step", training_step)
+
+    return install
+
+
+def raise_(error):
+    def action(loss):
+        raise error
+
+    return action
+
+
+def state(tmp_path):
+    return json.loads((tmp_path / "run" / "status.json").read_text())["state"]
+
+
+def test_nan_in_training_stops_keeps_the_last_good_checkpoint_and_names_the_batch(
+    tmp_path, breaks_at_step
+):
+    breaks_at_step(7, lambda loss: loss * float("nan"))
+    with pytest.raises(NonFiniteLossError, match=r"(?s)step 7.*instance") as error:
+        train(tiny_run(tmp_path))
+    assert ".ckpt" in str(error.value)
+    assert state(tmp_path) == "failed"
+    kept = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert kept["global_step"] == 5
+    assert all(torch.isfinite(v).all() for v in kept["state_dict"].values())
+
+
+def test_ctrl_c_keeps_the_last_checkpoint_and_says_how_to_go_on(tmp_path, breaks_at_step, capfd):
+    breaks_at_step(7, raise_(KeyboardInterrupt()))
+    with pytest.raises(SystemExit):
+        train(tiny_run(tmp_path))
+    assert state(tmp_path) == "interrupted"
+    assert f"resume={tmp_path}/run" in capfd.readouterr().err
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_full_disk_in_training_leaves_the_last_checkpoint_whole(tmp_path, breaks_at_step):
+    full = OSError(errno.ENOSPC, "No space left on device")
+    breaks_at_step(7, raise_(full))
+    with pytest.raises(OSError, match="No space left"):
+        train(tiny_run(tmp_path))
+    assert state(tmp_path) == "failed"
+    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["global_step"] == 5
+
+
+def test_a_second_run_never_overwrites_the_first(tmp_path):
+    train(tiny_run(tmp_path, "trainer.max_steps=2", "run=[fit]"))
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    with pytest.raises(ConfigurationError, match="holds a run already"):
+        train(tiny_run(tmp_path, "trainer.max_steps=2", "seed=5"))
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+
+
+def test_evaluating_with_data_of_another_meaning_is_refused(tmp_path):
+    train(tiny_run(tmp_path, "trainer.max_steps=2", "run=[fit]"))
+    config = compose([f"run={tmp_path}/run"], "evaluate")
+    with open_dict(config):
+        config.data.object = "car"
+    with pytest.raises(ConfigurationError, match="class_names"):
+        evaluate(config)

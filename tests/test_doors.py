@@ -97,7 +97,7 @@ def test_predict_says_rotation_confidence_and_alternatives_and_draws(door, workp
     store = next((workplace / "data" / "renders").rglob("test/images.npy"))
     Image.fromarray(np.load(store)[0, 0]).save(workplace / "view.png")
     done = door("predict", f"run={folder}", "input=view.png", "output=out", cwd=workplace)
-    result = json.loads((workplace / "out" / "view.json").read_text())
+    result = json.loads((workplace / "out" / "view_pose.json").read_text())
     rotation = np.array(result["rotation"])
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
     x, y, z, w = result["quaternion_xyzw"]
@@ -105,7 +105,7 @@ def test_predict_says_rotation_confidence_and_alternatives_and_draws(door, workp
     assert 2 * (x * y - z * w) == pytest.approx(rotation[0, 1], abs=1e-5)
     assert len(result["alternatives"]) == 3
     assert 0 < result["confidence"] <= 1
-    assert (workplace / "out" / "view.png").stat().st_size > 5000
+    assert (workplace / "out" / "view_pose.png").stat().st_size > 5000
     for word in ("rotation", "quaternion", "confidence"):
         assert word in done.stdout
 
@@ -168,7 +168,7 @@ def test_a_sweep_runs_every_job_in_a_folder_of_its_own(door, workplace):
         "paths.runs_dir=sweep",
         cwd=workplace,
     )
-    folders = sorted((workplace / "sweep").iterdir())
+    folders = sorted(p for p in (workplace / "sweep").iterdir() if p.is_dir())
     states = [json.loads((f / "status.json").read_text()) for f in folders]
     assert [s["state"] for s in states] == ["done", "done"]
     assert states[0]["config_hash"] != states[1]["config_hash"]

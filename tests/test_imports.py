@@ -17,10 +17,7 @@ ALLOWED = {
     "models": {"nn", "geometry"},
     "data": {"geometry", "rendering"},
     "tasks": {"models", "nn", "metrics", "data.info"},
-    "runs": {
-        "tasks", "data", "models", "metrics", "rendering",
-        "predictor", "viz", "callbacks",  # the loader hands out a predictor, the results are drawn
-    },
+    "runs": {"tasks", "data", "models", "metrics", "configuration"},
 }  # fmt: skip
 
 

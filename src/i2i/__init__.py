@@ -9,7 +9,7 @@ __all__ = ["__version__", "load"]
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever the attribute is
     """Import `load` when it is first asked for: rendering processes never pay for torch."""
     if name == "load":
-        from i2i.runs.loading import load
+        from i2i.predictor import load
 
         return load
     raise AttributeError(f"module 'i2i' has no attribute {name!r}")

@@ -8,11 +8,18 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from i2i.configuration import config_dir, register_resolvers
 from i2i.errors import ConfigurationError, I2IError
+
+# OSError: a disk that is full, a file that may not be read; the rest are settings that do not fit.
+_CAUSED_BY_USERS = (
+    I2IError, ValueError, OSError, HydraException, OmegaConfBaseException,
+    MisconfigurationException,
+)  # fmt: skip
 
 
 def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
@@ -30,7 +37,7 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
         def shell(cfg: DictConfig) -> None:
             try:
                 function(cfg)
-            except (I2IError, ValueError, HydraException, OmegaConfBaseException) as error:
+            except _CAUSED_BY_USERS as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(f"error: {readable(error)}", file=sys.stderr)
@@ -50,7 +57,9 @@ def readable(error: BaseException) -> str:
     """The message of the error inside what Hydra and OmegaConf wrapped around it."""
     inner: BaseException | None = error
     while inner is not None:
-        if isinstance(inner, I2IError) or (inner is not error and type(inner) is ValueError):
+        if isinstance(inner, I2IError) or (
+            inner is not error and type(inner) in (ValueError, MisconfigurationException)
+        ):
             return str(inner)
         inner = inner.__cause__
     if "Missing mandatory value" in str(error):

@@ -1,5 +1,7 @@
 """Where the configuration lies, its resolvers, and composing it from Python."""
 
+import hashlib
+import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +21,9 @@ LABEL_FRAMES: dict[str, dict[str, str]] = {
     "reference": {"target": "rotation", "group_frame": "standard", "projector_axes": "published"},
 }
 
-_STARTED = time.strftime("%Y%m%d-%H%M%S")
+# In the environment, so that the processes that a trainer starts name the same run folder.
+_STARTED = os.environ.setdefault("I2I_STARTED", time.strftime("%Y%m%d-%H%M%S"))
+_LONGEST_SLUG = 60
 
 
 def config_dir() -> str:
@@ -58,7 +62,6 @@ def register_resolvers() -> None:
         "i2i.started": lambda: _STARTED,
         "i2i.image_size": _image_size,
         "i2i.coverage": _coverage,
-        "i2i.channels": _channels,
         "i2i.run_dir": _run_dir,
     }
     for name, function in resolvers.items():
@@ -77,7 +80,10 @@ def slug(value: object) -> str:
     if OmegaConf.is_config(value):
         value = OmegaConf.to_container(value)
     text = "-".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-") or "none"
+    clean = re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-") or "none"
+    if len(clean) <= _LONGEST_SLUG:
+        return clean
+    return f"{clean[: _LONGEST_SLUG - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def _label_frame(frame: str, field: str) -> str:
@@ -97,10 +103,6 @@ def _image_size(size: int, stem_mode: str | None) -> int:
 def _coverage(stem_mode: str | None) -> float:
     """Keep the mesh at the same pixels: the odd stem makes a map of 9 cells where others make 8."""
     return 0.8 if stem_mode == "odd" else 0.9
-
-
-def _channels(modality: str) -> int:
-    return 3 if modality == "rgb" else 1
 
 
 def _run_dir(resume: str | None, runs_dir: str, run_name: str) -> str:

@@ -8,11 +8,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from i2i.callbacks.record import PredictionRecord
 from i2i.cli import door
-from i2i.configuration import register_resolvers
-from i2i.runs.building import build_datamodule
+from i2i.configuration import register_resolvers, slug
+from i2i.data.info import DataInfo
+from i2i.errors import ConfigurationError
+from i2i.finishing import draw
+from i2i.runs.building import build_datamodule, follow_root
 from i2i.runs.folder import RunFolder, write_json
 from i2i.runs.loading import load_task, locate
-from i2i.runs.results import draw, summarise
+from i2i.runs.results import summarise
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
@@ -27,13 +30,14 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     register_resolvers()
     folder, checkpoint = locate(cfg.run, cfg.ckpt)
     task = load_task(checkpoint)
-    config = OmegaConf.merge(task.run_config, {"data": cfg.data})
+    changes = {key: value for key, value in cfg.data.items() if value is not None}
+    config = OmegaConf.merge(task.run_config, {"data": changes})
     assert isinstance(config, DictConfig)
-    if config.data.get("root") != task.run_config["data"].get("root"):
-        config.data.source.root = config.data.root
+    follow_root(config)
     datamodule = build_datamodule(config)
+    _check_same_data(task.info, datamodule.info)
     datamodule.prepare_data()
-    output = RunFolder(Path(cfg.output) if cfg.output else folder.path / "evaluation")
+    output = RunFolder(Path(cfg.output) if cfg.output else folder.path / _folder_name(changes))
     record = PredictionRecord(output.predictions)
     trainer = Trainer(
         accelerator=cfg.trainer.accelerator,
@@ -46,17 +50,41 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         default_root_dir=str(output.path),
     )
     trainer.test(task, datamodule=datamodule, verbose=False)
+    if not trainer.is_global_zero:
+        return {"metrics": {}, "intervals": {}, "output": str(output.path)}
     summary = summarise(record.arrays, task.info, retrieval_samples=cfg.retrieval_samples)
-    if trainer.is_global_zero:
-        write_json(output.metrics, summary)
-        draw(output, record.arrays, task, datamodule)
+    write_json(output.metrics, summary)
+    draw(output, record.arrays, task.info, datamodule)
     return summary | {"output": str(output.path)}
+
+
+def _folder_name(changes: dict[str, Any]) -> str:
+    """`evaluation`, or with what was changed, so that no evaluation overwrites another."""
+    kept = {k: v for k, v in changes.items() if k not in ("root", "store_root")}
+    return "-".join(["evaluation", *(slug(f"{key}-{value}") for key, value in kept.items())])
+
+
+def _check_same_data(trained: DataInfo, given: DataInfo) -> None:
+    """Refuse data that mean something else than those of the training.
+
+    Raises:
+        ConfigurationError: naming the field and both values.
+    """
+    for field in ("class_names", "channels", "image_size", "modality"):
+        asked, known = getattr(given, field), getattr(trained, field)
+        if asked != known:
+            raise ConfigurationError(
+                f"the run was trained with {field} {known}, these data have {asked}: leave the "
+                "data's object, modality and size as they were"
+            )
 
 
 @door("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print every metric of a run with its interval."""
     summary = evaluate(cfg)
+    if not summary["metrics"]:
+        return
     for name, value in summary["metrics"].items():
         interval = summary["intervals"].get(name)
         tail = f"  [{interval[0]:.4g}, {interval[1]:.4g}]" if interval else ""

@@ -1,6 +1,7 @@
 """How the object in a picture is turned: `python -m i2i.predict run=... input=photo.png`."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 from i2i.cli import door
 from i2i.configuration import register_resolvers
 from i2i.errors import ImageError
-from i2i.runs.loading import load, locate
+from i2i.prediction_results import PoseResult
+from i2i.predictor import load
+from i2i.runs.loading import locate
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
@@ -34,14 +37,21 @@ def predict(cfg: DictConfig) -> dict[str, Any]:
     options = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(options, dict)
     results: dict[str, Any] = {}
-    for path in _pictures(Path(cfg.input)):
+    pictures = _pictures(Path(cfg.input))
+    stems = Counter(path.stem for path in pictures)
+    for path in pictures:
         result = predictor.predict(
             path,
-            **{k: options[k] for k in ("class_name", "mask", "box", "intrinsics")},
+            **{k: options[k] for k in ("class_name", "mask", "box", "intrinsics", "margin")},
         )
-        result.draw(output / f"{path.stem}.png")
-        (output / f"{path.stem}.json").write_text(json.dumps(result.to_dict(), indent=1) + "\n")
-        print(f"{path}\n{result}\npicture {output / f'{path.stem}.png'}\n")
+        # "_pose" or "_class": an answer beside its picture never takes the picture's own name.
+        stem = path.stem if stems[path.stem] == 1 else path.name.replace(".", "_")
+        answer = output / f"{stem}_{'pose' if isinstance(result, PoseResult) else 'class'}.png"
+        if answer in pictures:
+            raise ImageError(f"{answer} is itself an input picture: give another output=...")
+        result.draw(answer)
+        answer.with_suffix(".json").write_text(json.dumps(result.to_dict(), indent=1) + "\n")
+        print(f"{path}\n{result}\npicture {answer}\n")
         results[str(path)] = result
     return results
 

@@ -26,6 +26,7 @@ from i2i.models.prediction import PosePrediction
 from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.reference import load_mesh
+from i2i.runs.loading import load_task, locate
 
 SAME_ANSWER_DEG = 15.0
 """Candidates closer than this to a better one count as the same answer; their mass is added up."""
@@ -212,6 +213,30 @@ class Predictor:
                 camera_from_crop=np.eye(3),
             ),
         )  # fmt: skip
+
+
+def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> Predictor:
+    """Load a trained network for prediction.
+
+    Args:
+        run: A run folder, or a checkpoint file.
+        ckpt: `last` or `best`, when a folder is given.
+        device: Where the network goes.
+
+    Returns:
+        A predictor with `.predict(image)`.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, or one of another format.
+    """
+    folder, path = locate(run, ckpt)
+    task = load_task(path)
+    return Predictor(
+        task.network.to(device),
+        task.info,
+        config=task.run_config,
+        run_folder=folder.path,
+    )
 
 
 def _check_finite(values: Tensor) -> None:

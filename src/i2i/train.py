@@ -7,30 +7,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
+from i2i.callbacks.record import PredictionRecord
+from i2i.callbacks.steps import StopAfterSteps
 from i2i.cli import door, given_overrides, refuse
 from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError
-from i2i.runs.building import build_datamodule, build_task
+from i2i.finishing import finish
+from i2i.runs.building import build_datamodule, build_task, follow_root
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
 from i2i.runs.identity import config_hash
 from i2i.runs.loading import load_weights, read_checkpoint
-from i2i.runs.results import finish
 from i2i.tasks.base import Task
 
 log = logging.getLogger(__name__)
 
 # What may be typed beside resume=...: where things lie and on what they run, not what is computed.
-_WITH_RESUME = ("resume", "run=", "paths.", "trainer.", "data.root", "data.num_workers", "hydra.")
+_WITH_RESUME = (
+    "resume", "run=", "trainer.accelerator", "trainer.devices", "trainer.strategy",
+    "trainer.enable_", "data.root", "data.store_root", "data.num_workers",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,30 +69,31 @@ def train(cfg: DictConfig) -> RunResult:
     if cfg.resume:
         cfg = _resumed(cfg, folder)
     config = plain(cfg)
-    _refuse_ddp_in_multirun(config)
     identity = config_hash(config)
     seed_everything(cfg.seed, workers=True, verbose=False)
 
     datamodule = build_datamodule(cfg)
-    datamodule.prepare_data()
-    task = build_task(cfg, datamodule.info)
     trainer = _trainer(cfg, folder)
     if trainer.is_global_zero:
         _open(folder, config, identity, resumed=bool(cfg.resume))
     try:
+        datamodule.prepare_data()
+        task = build_task(cfg, datamodule.info)
         _run_stages(cfg, folder, trainer, task, datamodule)
+        metrics = finish(folder, trainer, task, datamodule, config=config, identity=identity)
     except BaseException as error:
         _close_broken(folder, trainer, error)
         raise
-    metrics = finish(folder, trainer, task, config=config, identity=identity)
     return RunResult(metrics, folder.path, task, datamodule)
 
 
+def _in_sweep() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
 def _run_dir(cfg: DictConfig) -> Path:
-    """Hydra's folder when Hydra runs the job, else the one that the configuration names."""
-    if HydraConfig.initialized() and not cfg.resume:
-        return Path(HydraConfig.get().runtime.output_dir)
-    return Path(cfg.run_dir)
+    """Hydra's folder for a job of a sweep, else the one that the configuration names."""
+    return Path(HydraConfig.get().runtime.output_dir if _in_sweep() else cfg.run_dir)
 
 
 def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
@@ -104,48 +110,67 @@ def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
         )
     saved = OmegaConf.create(yaml.safe_load(folder.config.read_text()))
     assert isinstance(saved, DictConfig)
-    typed = OmegaConf.from_dotlist(
-        [o.lstrip("+") for o in given_overrides() if o.startswith(("trainer.", "data.", "paths."))]
-    )
+    words = [word.lstrip("+") for word in given_overrides()]
+    typed = OmegaConf.from_dotlist([w for w in words if w.startswith(("trainer.", "data."))])
     merged = OmegaConf.merge(saved, typed, {"resume": cfg.resume, "run": cfg.run})
     assert isinstance(merged, DictConfig)
     merged.run_dir = str(folder.path)
+    follow_root(merged)
     return merged
 
 
-def _refuse_ddp_in_multirun(config: dict[str, Any]) -> None:
-    """Lightning's extra processes repeat the whole command line, which would repeat the sweep.
+def _check_processes(trainer: Trainer) -> None:
+    """Refuse ways of starting processes that would lose results or repeat a sweep.
 
     Raises:
-        ConfigurationError: for a sweep with more than one device a job.
+        ConfigurationError: naming the reason and what to use instead.
     """
-    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
-        return
-    devices, strategy = config["trainer"]["devices"], str(config["trainer"].get("strategy"))
-    if devices not in (1, "1", "auto") and "spawn" not in strategy and "fork" not in strategy:
+    if trainer.world_size > 1 and _in_sweep():
         raise ConfigurationError(
-            f"a sweep (-m) with trainer.devices={devices}: every extra process would start the "
-            "whole sweep again. Use trainer.devices=1, or trainer.strategy=ddp_spawn"
+            f"a sweep (-m) with {trainer.world_size} processes a job: every extra process would "
+            "start the whole sweep again. Use trainer.devices=1"
+        )
+    launcher = trainer.strategy.launcher
+    if launcher is not None and launcher.is_interactive_compatible:
+        raise ConfigurationError(
+            "trainer.strategy with spawn or fork: its processes end with the test and take the "
+            "predictions with them. Use trainer.strategy=ddp"
         )
 
 
 def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
-    callbacks: list[Callback] = [
-        instantiate(
-            c, **({"dirpath": str(folder.checkpoints)} if "ModelCheckpoint" in c._target_ else {})
-        )
-        for c in cfg.callbacks.values()
-        if c is not None
-    ]
+    callbacks: list[Callback] = [instantiate(c) for c in cfg.callbacks.values() if c is not None]
+    for callback in callbacks:  # they write into the run's folder, which the YAML files do not know
+        if isinstance(callback, ModelCheckpoint):
+            callback.dirpath = str(folder.checkpoints.absolute())
+        elif isinstance(callback, PredictionRecord):
+            callback.path = folder.predictions
+    length = {}
+    if cfg.trainer.max_steps > 0:
+        callbacks.append(StopAfterSteps(cfg.trainer.max_steps))
+        epoch = cfg.data.get("batches_per_epoch")  # the progress bar counts epochs of this length
+        epochs = -(-cfg.trainer.max_steps // epoch) if epoch else -1
+        length = {"max_steps": -1, "max_epochs": epochs}
     logger = instantiate(cfg.logger, save_dir=str(folder.path)) if cfg.logger else False
-    return instantiate(
-        cfg.trainer, callbacks=callbacks, logger=logger, default_root_dir=str(folder.path),
+    trainer: Trainer = instantiate(
+        cfg.trainer,
+        **length,
+        callbacks=callbacks,
+        logger=logger,
+        default_root_dir=str(folder.path),
         _convert_="all",
-    )  # fmt: skip
+    )
+    _check_processes(trainer)
+    return trainer
 
 
 def _open(folder: RunFolder, config: dict[str, Any], identity: str, *, resumed: bool) -> None:
     if not resumed:
+        if folder.config.exists():
+            raise ConfigurationError(
+                f"{folder.path} holds a run already: go on with it by resume={folder.path}, or "
+                "choose another run_name"
+            )
         write_yaml(folder.config, config)
     write_json(folder.path / "versions.json", versions())
     folder.write_status("running", config_hash=identity, command=shlex.join(sys.argv))
@@ -174,7 +199,7 @@ def _run_stages(
 
 def _close_broken(folder: RunFolder, trainer: Trainer, error: BaseException) -> None:
     """Leave a status behind, and tell how to go on."""
-    if not trainer.is_global_zero:
+    if not trainer.is_global_zero or not folder.status.exists():
         return
     interrupted = isinstance(error, KeyboardInterrupt | SystemExit)
     folder.write_status("interrupted" if interrupted else "failed", error=str(error)[:500])
@@ -200,7 +225,6 @@ def main(cfg: DictConfig) -> None:
     """Train and test one network, or every job of a sweep."""
     if cfg.print_config:
         print(OmegaConf.to_yaml(cfg, resolve=True))
-    torch.set_float32_matmul_precision("high")
     result = train(cfg)
     _print_metrics(result.metrics, result.run_dir)
 

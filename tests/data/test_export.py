@@ -12,6 +12,7 @@ from i2i.data.export import (
 from i2i.data.sources.base import UP_AXES, MeshItem, MeshSource
 from i2i.data.sources.modelnet40 import ModelNet40
 from i2i.data.sources.shapenet55 import ShapeNet55
+from i2i.data.sources.sweethome import DEBIAN_ROOT, SweetHome
 from i2i.geometry.cameras import Camera
 from i2i.rendering.base import get_renderer
 from i2i.rendering.mesh import prepare_mesh
@@ -119,3 +120,28 @@ def test_off_keeps_every_bit(tmp_path):
     written = np.array([[float(word) for word in line.split()] for line in text[2 : 2 + count]])
     expected = np.concatenate([part.vertices for part in source.load(items[0]).dump()])
     np.testing.assert_array_equal(written, expected)
+
+
+@pytest.mark.skipif(
+    not list(DEBIAN_ROOT.glob("*.sh3f")),
+    reason="needs Debian's package sweethome3d-furniture",
+)
+def test_real_chairs_look_the_same_through_every_layout(tmp_path):
+    source = SweetHome()
+    items = source.items(["chair"])[::18]
+    export_modelnet_layout(source, items, tmp_path / "aligned")
+    export_shapenet_layout(source, items, tmp_path / "shapenet")
+    copies = {
+        "modelnet": (ModelNet40(tmp_path / "aligned"), ("gray", "depth")),
+        "shapenet": (ShapeNet55(tmp_path / "shapenet"), ("gray", "depth", "rgb")),
+    }
+    for copy, modalities in copies.values():
+        there = {item.instance_id: item for item in copy.items(["chair"])}
+        assert len(there) == len(items)
+        for item in items:
+            twin = there[item.instance_id]
+            for modality in modalities:
+                first, second = render(source, item, modality), render(copy, twin, modality)
+                assert (first != 255).mean() > 0.02
+                differs = np.abs(first.astype(int) - second.astype(int)) > 4
+                assert differs.mean() < 0.01, (item.instance_id, modality, differs.mean())

@@ -269,3 +269,19 @@ def test_wrong_settings_are_refused(tmp_path):
         render(tmp_path, modality="grey")
     with pytest.raises(ValueError, match="render_workers=-1"):
         render(tmp_path, num_workers=-1)
+
+
+def test_a_repaired_mesh_is_rendered_by_the_same_command(tmp_path):
+    """A file that could not be read and was replaced since is neither skipped nor refused."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"box_{number:02d}.off").write_text("a mesh" if number != 1 else "rubbish")
+    broken = FakeSource({"box": 3}, broken=["box_01"], root=folder)
+    first = render(tmp_path / "store", broken)
+    (folder / "box_01.off").write_text("a mesh after all")
+    second = render(tmp_path / "store", FakeSource({"box": 3}, root=folder))
+    card = RenderedStore.open(second["box", "train"]).card
+    assert first == second
+    assert [entry["id"] for entry in card["items"]] == ["box_00", "box_01", "box_02"]
+    assert card["skipped"] == []

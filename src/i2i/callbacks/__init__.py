@@ -5,6 +5,7 @@ from i2i.callbacks.guard import NonFiniteLossGuard
 from i2i.callbacks.hparams import HyperparameterMetrics
 from i2i.callbacks.images import PredictionImages
 from i2i.callbacks.record import PredictionRecord
+from i2i.callbacks.steps import StopAfterSteps
 
 __all__ = [
     "ErrorHistogram",
@@ -12,4 +13,5 @@ __all__ = [
     "NonFiniteLossGuard",
     "PredictionImages",
     "PredictionRecord",
+    "StopAfterSteps",
 ]

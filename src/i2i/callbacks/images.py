@@ -41,7 +41,7 @@ class PredictionImages(Callback):
         if every_n_validations < 1 or max_images < 1:
             raise ValueError(
                 f"every_n_validations={every_n_validations} and max_images={max_images} must be "
-                "at least 1; callbacks.prediction_images=null turns the pictures off."
+                "at least 1; callbacks.images=null turns the pictures off."
             )
         self.every_n_validations = every_n_validations
         self.max_images = max_images

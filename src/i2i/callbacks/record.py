@@ -15,9 +15,9 @@ from i2i.models.prediction import PosePrediction
 class PredictionRecord(Callback):
     """Collects per-image test predictions and writes one npz, in the order of the test set.
 
-    The arrays of a pose run: `rotation_true`, `rotation_pred` (N, 3, 3), `error_deg`, `confidence`
-    (N,), `class_id`, `instance_id`, `view_id` (N,); of a classification run `logits` (N, C) and
-    `descriptor` (N, D) instead of the rotations.
+    The arrays of a pose run: `rotation_true`, `rotation_pred` (N, 3, 3), `error_deg`,
+    `element_probability`, `class_id`, `instance_id`, `view_id` (N,); of a classification run
+    `logits` (N, C) and `descriptor` (N, D) instead of the rotations.
 
     Args:
         path: The file to write; None keeps the arrays in `.arrays` only.
@@ -46,7 +46,7 @@ class PredictionRecord(Callback):
             kept["rotation_pred"] = prediction.rotation
             kept["error_deg"] = error_deg(prediction.rotation, batch["rotation"])
             if prediction.log_prob is not None:
-                kept["confidence"] = prediction.log_prob.max(dim=-1).values.exp()
+                kept["element_probability"] = prediction.log_prob.max(dim=-1).values.exp()
             if outputs.get("group_correct") is not None:
                 kept["group_correct"] = outputs["group_correct"]
         else:

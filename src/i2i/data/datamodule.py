@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from i2i.data.dataset import ImageBlock
-from i2i.data.info import CHANNELS, SYMMETRIES, DataInfo
+from i2i.data.info import CHANNELS, DataInfo
 from i2i.data.loaders import ImageDataModule, LoaderSettings, SplitData
 from i2i.data.reference import reference_meshes
 from i2i.data.rendering_job import StorePaths, render_store, store_settings
-from i2i.data.sources.base import MeshItem, MeshSource
+from i2i.data.sources.base import MeshItem, MeshSource, override_symmetry
 from i2i.data.splits import Splits, class_modes, split_items
 from i2i.data.store import RenderedStore
 from i2i.geometry.cameras import Camera
@@ -112,7 +112,7 @@ class RenderedDataModule(ImageDataModule):
         )
         super().__init__(loader, modality=modality, image_size=image_size)
         self.source = source
-        self.class_names = _class_names(source, object)
+        self.class_names = source.check_classes(source.classes if object == "all" else object)
         self.renderer = renderer
         self.modality = modality
         self.image_size = image_size
@@ -128,7 +128,8 @@ class RenderedDataModule(ImageDataModule):
         self.folds = folds
         self.seed = seed
         self.strip_symmetry = strip_symmetry
-        self.symmetry = _symmetries(source, self.class_names, symmetry)
+        chosen = override_symmetry(source.symmetry, symmetry)
+        self.symmetry = tuple(chosen[name] for name in self.class_names)
         self.render_workers = render_workers
         self.store_root = Path(store_root)
         self.strict = strict
@@ -281,43 +282,6 @@ class RenderedDataModule(ImageDataModule):
         if self.strip_symmetry and self.symmetry[class_id] == "z" and len(rotations):
             rotations = strip_z_symmetry(torch.from_numpy(rotations)).numpy()
         return rotations.astype(np.float32)
-
-
-def _class_names(source: MeshSource, object: str | Sequence[str]) -> tuple[str, ...]:
-    """Chosen classes, each once.
-
-    Raises:
-        ValueError: if the source does not have one of them.
-    """
-    names = (
-        tuple(source.classes)
-        if object == "all"
-        else ((object,) if isinstance(object, str) else tuple(dict.fromkeys(object)))
-    )
-    unknown = [name for name in names if name not in source.classes]
-    if unknown or not names:
-        raise ValueError(
-            f"data.object={object!r}: {source.name} has no class {', '.join(unknown) or '(none)'}. "
-            f"Allowed: all, {', '.join(source.classes)}."
-        )
-    return names
-
-
-def _symmetries(
-    source: MeshSource, class_names: Sequence[str], symmetry: str | Mapping[str, str] | None
-) -> tuple[str, ...]:
-    """Symmetry of each class: the source's own unless it is overridden."""
-    if isinstance(symmetry, str):
-        override: Mapping[str, str] = dict.fromkeys(class_names, symmetry)
-    else:
-        override = symmetry or {}
-    chosen = tuple(override.get(name, source.symmetry.get(name, "none")) for name in class_names)
-    for name, value in zip(class_names, chosen, strict=True):
-        if value not in SYMMETRIES:
-            raise ValueError(
-                f"data.symmetry of {name} is {value!r}. Allowed: {', '.join(SYMMETRIES)}."
-            )
-    return chosen
 
 
 def _positive(name: str, value: int) -> int:

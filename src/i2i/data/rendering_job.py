@@ -225,7 +225,10 @@ def _plan(
         name, print_ = item.instance_id, mesh_fingerprint(item)
         known = there.get(name)
         if known is not None and known["fingerprint"] != print_:
-            raise mesh_mismatch(plan.folder, name)
+            if "reason" in known:  # it could not be read then, and has been replaced since
+                known = None
+            else:
+                raise mesh_mismatch(plan.folder, name)
         plan.fingerprints[name] = print_
         if known is not None and "reason" in known:
             plan.failed[name] = known["reason"]
@@ -306,6 +309,7 @@ def _assemble(context: RenderContext, plan: _Plan) -> None:
             }
             entries.pop(name, None)
             continue
+        skipped.pop(name, None)
         data = _chunk_data(plan.chunks[name][0])
         entries[name] = {
             "id": name,

@@ -31,6 +31,12 @@ def build_datamodule(config: Config) -> ImageDataModule:
     return made
 
 
+def follow_root(config: DictConfig) -> None:
+    """Let the source of a resolved configuration read from `data.root` after that was changed."""
+    if "source" in config.data and "root" in config.data.source:
+        config.data.source.root = config.data.root
+
+
 def build_task(config: Config, info: DataInfo) -> Task:
     """The task and its network, with fresh weights.
 

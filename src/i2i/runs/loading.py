@@ -1,8 +1,8 @@
-"""The one way to load a checkpoint: read, check, build, load, and rebuild every cached kernel."""
+"""The one way to load a checkpoint: read it without running code, check, build, load."""
 
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -11,35 +11,6 @@ from i2i.errors import CheckpointError
 from i2i.runs.building import build_task
 from i2i.runs.folder import RunFolder
 from i2i.tasks.base import CHECKPOINT_FORMAT, Task
-
-if TYPE_CHECKING:
-    from i2i.predictor import Predictor
-
-
-def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> "Predictor":
-    """Load a trained network for prediction.
-
-    Args:
-        run: A run folder, or a checkpoint file.
-        ckpt: `last` or `best`, when a folder is given.
-        device: Where the network goes.
-
-    Returns:
-        A predictor with `.predict(image)`.
-
-    Raises:
-        CheckpointError: if there is no checkpoint, or one of another format.
-    """
-    from i2i.predictor import Predictor  # imports the drawing libraries, which training need not
-
-    folder, path = locate(run, ckpt)
-    task = load_task(path)
-    return Predictor(
-        task.network.to(device),
-        task.info,
-        config=task.run_config,
-        run_folder=folder.path,
-    )
 
 
 def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
@@ -69,8 +40,6 @@ def load_task(path: Path) -> Task:
     ours = checkpoint["i2i"]
     task = build_task(ours["config"], DataInfo.from_dict(ours["data"]))
     load_weights(task, checkpoint, path)
-    # Passing through training mode throws away every kernel that was expanded from other weights.
-    task.train()
     return task.eval()
 
 

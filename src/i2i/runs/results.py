@@ -6,24 +6,22 @@
 import json
 import sys
 from collections import defaultdict
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning import Callback, Trainer
 from torch import Tensor
+from torchmetrics import Metric
 
-from i2i.callbacks.record import PredictionRecord
+from i2i.configuration import slug
 from i2i.data.info import DataInfo
-from i2i.data.loaders import ImageDataModule
 from i2i.metrics.bootstrap import Interval, instance_bootstrap
+from i2i.metrics.classification import ClassAccuracy
 from i2i.metrics.retrieval import RetrievalMAP
-from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, axis_error_deg, pose_scores
-from i2i.rendering.reference import decimate_mesh, save_mesh
-from i2i.runs.folder import RunFolder, read_json, versions, write_json
-from i2i.tasks.base import Task
+from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, PoseErrors
+from i2i.runs.folder import read_json, versions
 
 RESULT_FORMAT = 1
 Arrays = dict[str, np.ndarray]
@@ -51,35 +49,26 @@ def summarise(arrays: Arrays, info: DataInfo, *, retrieval_samples: int = 20_000
 def _summarise_pose(arrays: Arrays, info: DataInfo, instance: Tensor) -> dict[str, Any]:
     errors = torch.from_numpy(arrays["error_deg"]).double()
     class_id = torch.from_numpy(arrays["class_id"])
-    metrics = {name: value.item() for name, value in pose_scores(errors).items()}
-    if "group_correct" in arrays:
-        metrics["group_accuracy"] = float(arrays["group_correct"].mean())
+    correct = arrays.get("group_correct")
+    metric = PoseErrors(info.class_names, info.symmetry)
+    metric.update(
+        torch.from_numpy(arrays["rotation_pred"]),
+        torch.from_numpy(arrays["rotation_true"]),
+        class_id=class_id,
+        instance_id=instance,
+        group_correct=None if correct is None else torch.from_numpy(correct),
+    )
     intervals = {"median_error_deg": _ends(instance_bootstrap(errors, instance))}
     flags = {f"acc_at_{deg}deg": errors < deg for deg in ACCURACY_DEG}
     flags["flip_rate"] = errors > FLIP_DEG
     for name, flag in flags.items():
         intervals[name] = _ends(instance_bootstrap(flag.double(), instance, statistic="mean"))
-    medians = []
-    for index, name in enumerate(info.class_names):
-        mine = class_id == index
-        if not mine.any():
-            continue
-        for key, value in pose_scores(errors[mine]).items():
-            metrics[f"{name}/{key}"] = value.item()
-        medians.append(metrics[f"{name}/median_error_deg"])
-        key = f"{name}/median_error_deg"
-        intervals[key] = _ends(instance_bootstrap(errors[mine], instance[mine]))
-        if info.symmetry[index] == "z":
-            axis = axis_error_deg(
-                torch.from_numpy(arrays["rotation_pred"])[mine],
-                torch.from_numpy(arrays["rotation_true"])[mine],
-            )
-            metrics[f"{name}/median_axis_error_deg"] = axis.quantile(0.5).item()
-    metrics["mean_class_median_error_deg"] = float(np.mean(medians))
+    for name, interval in metric.median_intervals().items():
+        intervals[f"{name}/median_error_deg"] = _ends(interval)
     by_instance = [
         [round(value, 2) for value in errors[instance == i].tolist()] for i in instance.unique()
     ]
-    return {"metrics": metrics, "intervals": intervals, "errors_deg": by_instance}
+    return {"metrics": _numbers(metric), "intervals": intervals, "errors_deg": by_instance}
 
 
 def _summarise_classes(
@@ -87,64 +76,63 @@ def _summarise_classes(
 ) -> dict[str, Any]:
     logits = torch.from_numpy(arrays["logits"])
     labels = torch.from_numpy(arrays["class_id"])
-    correct = (logits.argmax(dim=1) == labels).double()
-    metrics = {"accuracy": correct.mean().item()}
-    for index, name in enumerate(info.class_names):
-        if (labels == index).any():
-            metrics[f"{name}/accuracy"] = correct[labels == index].mean().item()
+    accuracy = ClassAccuracy(info.class_names)
+    accuracy.update(logits, labels)
     retrieval = RetrievalMAP(max_queries=retrieval_samples)
     retrieval.update(logits, torch.from_numpy(arrays["descriptor"]), labels, instance)
-    metrics |= {name: value.item() for name, value in retrieval.compute().items()}
+    correct = (logits.argmax(dim=1) == labels).double()
     interval = instance_bootstrap(correct, instance, statistic="mean")
-    fractions = [round(correct[instance == i].mean().item(), 4) for i in instance.unique()]
-    return {"metrics": metrics, "intervals": {"accuracy": _ends(interval)}, "correct": fractions}
+    return {
+        "metrics": _numbers(accuracy) | _numbers(retrieval),
+        "intervals": {"accuracy": _ends(interval)},
+        "correct": [round(correct[instance == i].mean().item(), 4) for i in instance.unique()],
+    }
+
+
+def _numbers(metric: Metric) -> dict[str, float]:
+    return {name: float(value) for name, value in metric.compute().items()}
 
 
 def _ends(interval: Interval) -> list[float]:
     return [interval.low, interval.high]
 
 
-def finish(
-    folder: RunFolder, trainer: Trainer, task: Task, *, config: dict[str, Any], identity: str
-) -> dict[str, float]:
-    """Write metrics, reference meshes, figures and the small result of a run that went through.
+def result(
+    summary: dict[str, Any],
+    config: dict[str, Any],
+    *,
+    identity: str,
+    instance_names: Sequence[str],
+    parameters: int,
+    steps: int,
+) -> dict[str, Any]:
+    """The small JSON of a finished job: what it was, what it gave, what made it.
 
-    Returns:
-        Final metrics by name, `test/...`; empty where no test was run.
+    Args:
+        summary: Of `summarise`.
+        config: The run's resolved configuration.
+        identity: Its hash.
+        instance_names: Name of each test instance, in the order of the summary's errors.
+        parameters: Trainable parameters of the network.
+        steps: Optimiser steps.
     """
-    record = next((c for c in _callbacks(trainer) if isinstance(c, PredictionRecord)), None)
-    if not trainer.is_global_zero:
-        return {}
-    datamodule: ImageDataModule = trainer.datamodule  # type: ignore[attr-defined]
-    save_reference_meshes(folder, task.info, datamodule)
-    if record is None or not record.arrays:
-        folder.write_status("done")
-        return {}
-    summary = summarise(record.arrays, task.info)
-    write_json(folder.metrics, summary)
-    draw(folder, record.arrays, task, datamodule)
-    result = {
+    return {
         "format": RESULT_FORMAT,
         "label": config.get("label"),
         "job": describe(config),
         "config_hash": identity,
-        "parameters": sum(p.numel() for p in task.network.parameters() if p.requires_grad),
-        "steps": trainer.global_step,
+        "parameters": parameters,
+        "steps": steps,
+        "instance_names": list(instance_names),
         "versions": versions(),
         **summary,
     }
-    write_json(folder.path / "result.json", result)
-    if config["paths"]["results_dir"]:
-        write_json(
-            Path(config["paths"]["results_dir"]) / f"{_file_name(config, identity)}.json", result
-        )
-    folder.write_status("done")
-    return {f"test/{name}": value for name, value in summary["metrics"].items()}
 
 
-def _callbacks(trainer: Trainer) -> list[Callback]:
-    found: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    return found
+def file_name(config: dict[str, Any], identity: str) -> str:
+    """Name of a job's JSON, from what it is and its hash."""
+    job = describe(config)
+    return f"{job['model']}-{job['data']}-{slug(job['object'])}-{job['scale']}-{identity}.json"
 
 
 def describe(config: dict[str, Any]) -> dict[str, Any]:
@@ -160,39 +148,18 @@ def describe(config: dict[str, Any]) -> dict[str, Any]:
         "scale": scale["name"],
         "seed": config["seed"],
         "views_per_instance": data.get("views_per_instance"),
+        "split": data.get("split"),
+        "fold": data.get("fold"),
         "precision": str(config["trainer"]["precision"]),
         "image_size": data["image_size"],
-        "label_frame": model.get("label_frame"),
+        "target": model.get("target"),
+        "group_frame": model.get("group_frame"),
+        "projector_axes": model.get("projector_axes"),
         "stem_mode": encoder.get("stem_mode"),
         "labels": scale.get("labels"),
+        "reg_on": scale.get("reg_on"),
         "sigma": scale.get("sigma"),
     }
-
-
-def _file_name(config: dict[str, Any], identity: str) -> str:
-    job = describe(config)
-    object_name = job["object"] if isinstance(job["object"], str) else "-".join(job["object"])
-    return f"{job['model']}-{job['data']}-{object_name}-{job['scale']}-{identity}"
-
-
-def save_reference_meshes(folder: RunFolder, info: DataInfo, datamodule: ImageDataModule) -> None:
-    """Keep one decimated mesh of each class, so that predictions can be drawn without the data."""
-    for name in info.class_names:
-        path = folder.reference_meshes / f"{name}.npz"
-        mesh = None if path.exists() else datamodule.reference_mesh(name)
-        if mesh is not None:
-            folder.reference_meshes.mkdir(parents=True, exist_ok=True)
-            save_mesh(decimate_mesh(mesh), path)
-
-
-def draw(folder: RunFolder, arrays: Arrays, task: Task, datamodule: ImageDataModule) -> None:
-    """Write the figures of a test: errors, and a grid of predictions."""
-    from i2i.viz.results import result_figures
-    from i2i.viz.style import save_figure
-
-    folder.figures.mkdir(parents=True, exist_ok=True)
-    for name, figure in result_figures(arrays, task.info, datamodule).items():
-        save_figure(figure, folder.figures / f"{name}.png")
 
 
 def collect(folder: Path) -> list[dict[str, Any]]:
@@ -206,29 +173,30 @@ def table(results: list[dict[str, Any]]) -> str:
 
     Intervals resample instances; an instance keeps its errors of all seeds together.
     """
-    rows: dict[tuple[str, Any], list[dict[str, Any]]] = defaultdict(list)
+    rows: dict[tuple[str, int, str], list[dict[str, Any]]] = defaultdict(list)
     for result in results:
         if "errors_deg" in result and result["label"]:
-            rows[result["label"], result["job"]["views_per_instance"]].append(result)
+            job = result["job"]
+            what = json.dumps([job[key] for key in ("data", "object", "scale", "fold")])
+            rows[result["label"], job["views_per_instance"], what].append(result)
     lines = [
         "| | views | seeds | steps | median error (°) | Acc@15 (%) | Acc@30 (%) |",
         "|---|--:|--:|--:|--:|--:|--:|",
     ]
-    for (label, views), members in rows.items():
-        pooled = [
-            list(chain.from_iterable(lists))
-            for lists in zip(*(m["errors_deg"] for m in members), strict=True)
-        ]
-        errors = torch.tensor(list(chain.from_iterable(pooled)), dtype=torch.float64)
-        instance = torch.tensor([i for i, e in enumerate(pooled) for _ in e])
+    for (label, views, _), members in sorted(rows.items()):
+        pooled: dict[str, list[float]] = defaultdict(list)
+        for member in members:
+            for name, values in zip(member["instance_names"], member["errors_deg"], strict=True):
+                pooled[name] += values
+        errors = torch.tensor([e for v in pooled.values() for e in v], dtype=torch.float64)
+        instance = torch.tensor([i for i, v in enumerate(pooled.values()) for _ in v])
         cells = [_cell(instance_bootstrap(errors, instance), 1)]
         for limit in ACCURACY_DEG:
             inside = (errors < limit).double()
             cells.append(_cell(instance_bootstrap(inside, instance, statistic="mean"), 100))
         steps = "/".join(map(str, sorted({m["steps"] for m in members})))
-        lines.append(
-            f"| {label} | {views} | {len(members)} | {steps} | " + " | ".join(cells) + " |"
-        )
+        seeds = len({m["job"]["seed"] for m in members})
+        lines.append("| " + " | ".join([label, str(views), str(seeds), steps, *cells]) + " |")
     return "\n".join(lines)
 
 

@@ -57,7 +57,7 @@ class Task(LightningModule):
         """Loss of one batch, logged with its terms."""
         terms = self.network.loss(self.network(batch), batch)  # type: ignore[operator]
         loss = torch.stack(list(terms.values())).sum()
-        size = len(batch["image"])
+        size = len(batch["class_id"])
         self.log("train/loss", loss, prog_bar=True, batch_size=size)
         self.log_dict({f"train/loss_{k}": v for k, v in terms.items()}, batch_size=size)
         return loss
@@ -80,7 +80,7 @@ class Task(LightningModule):
             on_step=False,
             on_epoch=True,
             sync_dist=True,
-            batch_size=len(batch["image"]),
+            batch_size=len(batch["class_id"]),
         )
         more = self.update_metrics(stage, prediction, batch)
         return {"prediction": prediction, "batch": batch, **more}

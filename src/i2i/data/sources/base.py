@@ -162,11 +162,25 @@ def resolve_symmetry(
     Raises:
         ValueError: A value that is not a symmetry, or a class that the source does not have.
     """
-    names = list(classes)
-    symmetry = {name: "z" if name in Z_SYMMETRIC_CLASSES else "none" for name in names}
+    published = {name: "z" if name in Z_SYMMETRIC_CLASSES else "none" for name in classes}
+    return override_symmetry(published, override)
+
+
+def override_symmetry(
+    symmetry: Mapping[str, str], override: str | Mapping[str, str] | None
+) -> dict[str, str]:
+    """Change the symmetry of all classes, of some, or of none.
+
+    Args:
+        symmetry: Of every class, by its name.
+        override: One value for all classes, a mapping from some classes to values, or None.
+
+    Raises:
+        ValueError: A value that is not a symmetry, or a class that is not there.
+    """
     if override is None:
-        return symmetry
-    settings = dict.fromkeys(names, override) if isinstance(override, str) else dict(override)
+        return dict(symmetry)
+    settings = dict.fromkeys(symmetry, override) if isinstance(override, str) else dict(override)
     for name, value in settings.items():
         if value not in SYMMETRIES:
             raise ValueError(
@@ -174,7 +188,6 @@ def resolve_symmetry(
             )
         if canonical_class_name(name) not in symmetry:
             raise ValueError(
-                f"symmetry names the class {name}, which is not one of: {', '.join(names)}."
+                f"symmetry names the class {name}, which is not one of: {', '.join(symmetry)}."
             )
-        symmetry[canonical_class_name(name)] = value
-    return symmetry
+    return {**symmetry, **{canonical_class_name(name): v for name, v in settings.items()}}
