@@ -233,3 +233,25 @@ def test_debug_configurations_run(door, workplace, debug):
     door("train", *small, f"debug={debug}", f"run_name=debug-{debug}",
          *(["trainer.max_steps=8"] if debug == "overfit" else []), cwd=workplace)  # fmt: skip
     assert Path(workplace / "runs" / f"debug-{debug}" / "config.yaml").is_file()
+
+
+def test_classification_trains_from_the_command_line(door, workplace):
+    done = door(
+        "train", *TINY, "task=classification", "data.object=[chair,car]", "run_name=classes",
+        cwd=workplace,
+    )  # fmt: skip
+    metrics = json.loads((workplace / "runs/classes/metrics.json").read_text())["metrics"]
+    arrays = np.load(workplace / "runs" / "classes" / "predictions.npz")
+    right = arrays["logits"].argmax(1) == arrays["class_id"]
+    assert metrics["accuracy"] == pytest.approx(right.mean())
+    for name in ("test/map_retrieval ", "test/map_class ", "test/chair/accuracy "):
+        assert name in done.stdout
+
+
+def test_one_network_learns_the_poses_of_two_classes(door, workplace):
+    door("train", *TINY, "data.object=[chair,car]", "run_name=joint", cwd=workplace)
+    metrics = json.loads((workplace / "runs/joint/metrics.json").read_text())["metrics"]
+    mean = (metrics["chair/median_error_deg"] + metrics["car/median_error_deg"]) / 2
+    assert metrics["mean_class_median_error_deg"] == pytest.approx(mean)
+    done = door("predict", "run=runs/joint", "input=nothing.png", cwd=workplace, check=False)
+    assert "nothing.png" in done.stderr
