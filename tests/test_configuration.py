@@ -29,8 +29,7 @@ def test_every_data_file_composes(name):
 def test_every_option_of_a_group_composes(group):
     assert options(group)
     for option in options(group):
-        word = f"+{group}={option}" if group in ("debug", "experiment") else f"{group}={option}"
-        plain(compose([word.replace("+", "")]))
+        plain(compose([f"{group}={option}"]))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Accuracy over all views, over classes and for each class."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ class ClassAccuracy(Metric):
 
     Args:
         class_names: Names by class id.
+        **options: Of `torchmetrics.Metric`, such as `sync_on_compute=False`.
 
     Example:
         >>> metric = ClassAccuracy(["bed", "desk"])
@@ -34,8 +36,8 @@ class ClassAccuracy(Metric):
 
     confusion: Tensor
 
-    def __init__(self, class_names: Sequence[str]) -> None:
-        super().__init__()
+    def __init__(self, class_names: Sequence[str], **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
         self.class_names = tuple(class_names)
         size = len(self.class_names)
         self.add_state(

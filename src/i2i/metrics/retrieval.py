@@ -1,5 +1,7 @@
 """Mean average precision, in the three readings that published numbers mix up."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -121,6 +123,7 @@ class RetrievalMAP(Metric):
         max_queries: Above this many samples the two retrieval numbers are taken over one view of
             each instance.
         seed: Of that choice.
+        **options: Of `torchmetrics.Metric`, such as `sync_on_compute=False`.
     """
 
     is_differentiable = False
@@ -133,9 +136,14 @@ class RetrievalMAP(Metric):
     instance_ids: list[Tensor]
 
     def __init__(
-        self, *, include_query: bool = False, max_queries: int = 20_000, seed: int = 0
+        self,
+        *,
+        include_query: bool = False,
+        max_queries: int = 20_000,
+        seed: int = 0,
+        **options: Any,  # noqa: ANN401 - torchmetrics' own
     ) -> None:
-        super().__init__()
+        super().__init__(**options)
         self.include_query, self.max_queries, self.seed = include_query, max_queries, seed
         for name in ("descriptors", "logits", "labels", "instance_ids"):
             self.add_state(name, default=[], dist_reduce_fx="cat")

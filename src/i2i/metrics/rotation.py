@@ -1,6 +1,7 @@
 """Rotation error and what is reported of it."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,6 +59,7 @@ class PoseErrors(Metric):
     Args:
         class_names: Names by class id.
         symmetry: `"none"` or `"z"` for each class; all `"none"` when left out.
+        **options: Of `torchmetrics.Metric`, such as `sync_on_compute=False`.
 
     Example:
         >>> metric = PoseErrors(["car"])
@@ -77,9 +79,12 @@ class PoseErrors(Metric):
     group_flags: list[Tensor]
 
     def __init__(
-        self, class_names: Sequence[str] = ("all",), symmetry: Sequence[str] | None = None
+        self,
+        class_names: Sequence[str] = ("all",),
+        symmetry: Sequence[str] | None = None,
+        **options: Any,  # noqa: ANN401 - torchmetrics' own
     ) -> None:
-        super().__init__()
+        super().__init__(**options)
         self.class_names = tuple(class_names)
         self.symmetry = tuple(symmetry) if symmetry is not None else ("none",) * len(class_names)
         if len(self.symmetry) != len(self.class_names):

@@ -30,6 +30,8 @@ Arrays = dict[str, np.ndarray]
 def summarise(arrays: Arrays, info: DataInfo, *, retrieval_samples: int = 20_000) -> dict[str, Any]:
     """Metrics of recorded test predictions, with 95 % intervals over resampled instances.
 
+    The arrays are those of all processes already, so nothing is reduced here.
+
     Args:
         arrays: What `PredictionRecord` wrote.
         info: What the data are.
@@ -50,7 +52,7 @@ def _summarise_pose(arrays: Arrays, info: DataInfo, instance: Tensor) -> dict[st
     errors = torch.from_numpy(arrays["error_deg"]).double()
     class_id = torch.from_numpy(arrays["class_id"])
     correct = arrays.get("group_correct")
-    metric = PoseErrors(info.class_names, info.symmetry)
+    metric = PoseErrors(info.class_names, info.symmetry, sync_on_compute=False)
     metric.update(
         torch.from_numpy(arrays["rotation_pred"]),
         torch.from_numpy(arrays["rotation_true"]),
@@ -76,9 +78,9 @@ def _summarise_classes(
 ) -> dict[str, Any]:
     logits = torch.from_numpy(arrays["logits"])
     labels = torch.from_numpy(arrays["class_id"])
-    accuracy = ClassAccuracy(info.class_names)
+    accuracy = ClassAccuracy(info.class_names, sync_on_compute=False)
     accuracy.update(logits, labels)
-    retrieval = RetrievalMAP(max_queries=retrieval_samples)
+    retrieval = RetrievalMAP(max_queries=retrieval_samples, sync_on_compute=False)
     retrieval.update(logits, torch.from_numpy(arrays["descriptor"]), labels, instance)
     correct = (logits.argmax(dim=1) == labels).double()
     interval = instance_bootstrap(correct, instance, statistic="mean")

@@ -95,7 +95,8 @@ class Task(LightningModule):
 
     def _log_metrics(self, stage: str) -> None:
         values = self.compute_metrics(stage)
-        self.log_dict({f"{stage}/{name}": value for name, value in values.items()}, sync_dist=False)
+        # The metrics are reduced already: the mean over processes that Lightning asks for is idle.
+        self.log_dict({f"{stage}/{name}": value for name, value in values.items()}, sync_dist=True)
 
     def update_metrics(
         self,
