@@ -62,6 +62,10 @@ def readable(error: BaseException) -> str:
         ):
             return str(inner)
         inner = inner.__cause__
+    if "raised while resolving interpolation: " in str(error):  # OmegaConf names no cause
+        return (
+            str(error).split("raised while resolving interpolation: ")[1].split("\n    full_key")[0]
+        )
     if "Missing mandatory value" in str(error):
         key = str(error).split("Missing mandatory value:")[-1].strip().splitlines()[0]
         return f"{key} is not set: give it as {key}=... on the command line"

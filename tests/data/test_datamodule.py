@@ -280,7 +280,7 @@ def test_skipped_mesh_is_left_out_everywhere(tmp_path):
 
 
 def test_errors_say_what_to_do(tmp_path):
-    with pytest.raises(ValueError, match=r"no class cup.*Allowed: all, box, can"):
+    with pytest.raises(ValueError, match=r"no class cup; it has: box, can.*data\.object"):
         make(tmp_path, object="cup")
     with pytest.raises(ValueError, match="views_per_instance=0"):
         make(tmp_path, views_per_instance=0)

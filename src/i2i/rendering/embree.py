@@ -139,12 +139,13 @@ def _smoothed(
     modality: str,
 ) -> NDArray[np.float32]:
     """Values of some pixels as the mean of four samples, shape (C, K)."""
+    if not len(pixel):  # a box seen along an axis has no edges that cut a pixel
+        return np.empty((CHANNELS[modality], 0), dtype=np.float32)
     directions = rays.samples(pixel).reshape(-1, 3)
     hits = scene.cast(directions, rotation, rays.camera.distance)
     values = np.full((CHANNELS[modality], len(directions)), BACKGROUND, dtype=np.float32)
     values[:, hits.ray] = scene.picture_values(hits, modality, rays.pixel_width)
-    samples = len(directions) // max(len(pixel), 1)  # not -1: a view can be without edge pixels
-    mean: NDArray[np.float32] = values.reshape(len(values), len(pixel), samples).mean(axis=-1)
+    mean: NDArray[np.float32] = values.reshape(len(values), len(pixel), -1).mean(axis=-1)
     return mean
 
 
