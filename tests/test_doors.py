@@ -255,3 +255,44 @@ def test_one_network_learns_the_poses_of_two_classes(door, workplace):
     assert metrics["mean_class_median_error_deg"] == pytest.approx(mean)
     done = door("predict", "run=runs/joint", "input=nothing.png", cwd=workplace, check=False)
     assert "nothing.png" in done.stderr
+
+
+@pytest.mark.parametrize("layout", ["modelnet", "shapenet"])
+def test_the_papers_row_trains_once_the_meshes_are_there(door, workplace, layout):
+    from i2i.data.export import export_modelnet_layout, export_shapenet_layout
+    from i2i.data.sources.synthetic import SyntheticSource
+
+    source = SyntheticSource(instances_per_class=5, test_instances_per_class=2)
+    export = {"modelnet": export_modelnet_layout, "shapenet": export_shapenet_layout}[layout]
+    export(source, source.items(["chair"]), workplace / layout)
+    door(
+        "train", "model=i2i", "task=pose", f"data={layout}_chair", f"data.root={layout}",
+        "scale=tiny", "data.views_per_instance=8", "data.test_views_per_instance=4",
+        f"run_name={layout}", "trainer.accelerator=cpu", cwd=workplace,
+    )  # fmt: skip
+    result = json.loads((workplace / "runs" / layout / "result.json").read_text())
+    assert result["job"]["modality"] == ("rgb" if layout == "shapenet" else "gray")
+    assert len(result["errors_deg"]) == (1 if layout == "shapenet" else 2)
+
+
+def test_pictures_with_labels_are_a_data_set(door, workplace, trained):
+    from PIL import Image
+    from scipy.spatial.transform import Rotation
+
+    folder = workplace / "pictures"
+    folder.mkdir()
+    store = next((workplace / "data" / "renders").rglob("chair/train/images.npy")).parent
+    images, rotations = np.load(store / "images.npy"), np.load(store / "rotations.npy")
+    rows = ["file,class,qx,qy,qz,qw,split"]
+    for number in range(40):
+        Image.fromarray(images[number, 0]).save(folder / f"{number}.png")
+        quaternion = ",".join(f"{v:.8f}" for v in Rotation.from_matrix(rotations[number]).as_quat())
+        split = "test" if number >= 32 else "val" if number >= 28 else "train"
+        rows.append(f"{number}.png,chair,{quaternion},{split}")
+    (folder / "labels.csv").write_text("\n".join(rows))
+    door(
+        "train", "data=images", "data.root=pictures", "data.modality=gray", "scale=tiny",
+        "run_name=pictures", "trainer.accelerator=cpu", cwd=workplace,
+    )  # fmt: skip
+    arrays = np.load(workplace / "runs" / "pictures" / "predictions.npz")
+    np.testing.assert_allclose(arrays["rotation_true"], rotations[32:40], atol=1e-5)
