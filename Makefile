@@ -39,7 +39,7 @@ lint: $(VENV)/.installed-dev
 	$(PY) -m codespell_lib src conf docs tests benchmarks README.md CONTRIBUTING.md CHANGELOG.md
 
 table: $(VENV)/.installed
-	$(PY) -m i2i.runs.results
+	$(PY) -m i2i.runs.results results "consistent labels"
 
 clean:
 	rm -rf $(VENV) build dist

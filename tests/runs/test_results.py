@@ -92,6 +92,15 @@ def test_the_table_pools_seeds_and_keeps_labels_apart(tmp_path):
     assert [cell.strip() for cell in lines[3].split("|")][1:4] == ["other", "60", "1"]
 
 
+def test_rows_are_compared_in_pairs_over_the_seeds_that_both_have(tmp_path):
+    shifted = made(label="other")
+    shifted["errors_deg"] = [[e - 1 for e in errors] for errors in shifted["errors_deg"]]
+    for number, content in enumerate([made(), made(seed=1), shifted]):
+        (tmp_path / f"{number}.json").write_text(json.dumps(content))
+    lines = table(collect(tmp_path), against="a label").splitlines()
+    assert [line.split("|")[-2].strip() for line in lines[2:]] == ["", "1.0 [1.0, 1.0]"]
+
+
 def test_the_identity_of_a_job_forgets_places_and_nothing_else():
     here = config_hash(CONFIG)
     assert config_hash(CONFIG | {"paths": {"data_dir": "elsewhere"}, "label": "x"}) == here

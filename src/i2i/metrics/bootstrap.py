@@ -86,15 +86,57 @@ def instance_bootstrap(
     values = values.double().cpu()
     unique, member = instance_id.cpu().unique(return_inverse=True)
     num_instances = len(unique)
-
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randint(num_instances, (num_resamples, num_instances), generator=generator)
-    counts = torch.zeros(num_resamples, num_instances, dtype=torch.int64)
-    counts.scatter_add_(1, drawn, torch.ones_like(drawn))
+    counts = _resampled_counts(num_instances, num_resamples, seed)
 
     rows = max(1, chunk_elements // len(values))
     resampled = torch.cat([function(values, chunk[:, member]) for chunk in counts.split(rows)])
+    value = function(values, torch.ones(1, len(values), dtype=torch.int64))
+    return _interval(value.item(), resampled, level, num_instances)
+
+
+def paired_median_difference(
+    first: Tensor,
+    second: Tensor,
+    instance_id: Tensor,
+    *,
+    num_resamples: int = 1000,
+    level: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """Interval of median(first) − median(second) over the same views of the same objects.
+
+    Both are resampled with the same instances, so what the objects have in common drops out.
+
+    Args:
+        first: (N,) one number per view.
+        second: (N,) the other's numbers of the same views.
+        instance_id: (N,) which instance each view shows.
+        num_resamples: Number of resamples.
+        level: Coverage of the interval.
+        seed: Seed of the resampling.
+
+    Example:
+        >>> first, second = torch.tensor([3.0, 5.0]), torch.tensor([1.0, 2.0])
+        >>> paired_median_difference(first, second, torch.tensor([0, 1])).value
+        2.5
+    """
+    first, second = first.double().cpu(), second.double().cpu()
+    unique, member = instance_id.cpu().unique(return_inverse=True)
+    weights = _resampled_counts(len(unique), num_resamples, seed)[:, member]
+    resampled = _weighted_median(first, weights) - _weighted_median(second, weights)
+    value = first.quantile(0.5) - second.quantile(0.5)
+    return _interval(value.item(), resampled, level, len(unique))
+
+
+def _resampled_counts(num_instances: int, num_resamples: int, seed: int) -> Tensor:
+    """How often each instance is drawn in each resample: (R, I)."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randint(num_instances, (num_resamples, num_instances), generator=generator)
+    counts = torch.zeros(num_resamples, num_instances, dtype=torch.int64)
+    return counts.scatter_add_(1, drawn, torch.ones_like(drawn))
+
+
+def _interval(value: float, resampled: Tensor, level: float, num_instances: int) -> Interval:
     tail = (1 - level) / 2
     low, high = torch.quantile(resampled, torch.tensor([tail, 1 - tail], dtype=torch.float64))
-    value = function(values, torch.ones(1, len(values), dtype=torch.int64))
-    return Interval(value.item(), low.item(), high.item(), num_instances)
+    return Interval(value, low.item(), high.item(), num_instances)

@@ -1,6 +1,6 @@
 """What a finished run says: metrics with intervals, figures, and the JSON that tables come from.
 
-`python -m i2i.runs.results [folder]` prints the table of the published results.
+`python -m i2i.runs.results [folder [label]]` prints the table of the published results.
 """
 
 import json
@@ -17,7 +17,7 @@ from torchmetrics import Metric
 
 from i2i.configuration import slug
 from i2i.data.info import DataInfo
-from i2i.metrics.bootstrap import Interval, instance_bootstrap
+from i2i.metrics.bootstrap import Interval, instance_bootstrap, paired_median_difference
 from i2i.metrics.classification import ClassAccuracy
 from i2i.metrics.retrieval import RetrievalMAP
 from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, PoseErrors
@@ -170,36 +170,58 @@ def collect(folder: Path) -> list[dict[str, Any]]:
     return [result for result in found if result.get("format") == RESULT_FORMAT]
 
 
-def table(results: list[dict[str, Any]]) -> str:
+def table(results: list[dict[str, Any]], *, against: str | None = None) -> str:
     """Markdown table of pose results: one row a label and number of views, seeds pooled.
 
     Intervals resample instances; an instance keeps its errors of all seeds together.
+
+    Args:
+        results: Of `collect`.
+        against: Label of a row to compare the others of as many views with: the last column is the
+            difference of the medians over the seeds that both have, resampled in pairs.
     """
     rows: dict[tuple[str, int, str], list[dict[str, Any]]] = defaultdict(list)
     for result in results:
         if "errors_deg" in result and result["label"]:
             job = result["job"]
             what = json.dumps([job[key] for key in ("data", "object", "scale", "fold")])
-            rows[result["label"], job["views_per_instance"], what].append(result)
-    lines = [
-        "| | views | seeds | steps | median error (°) | Acc@15 (%) | Acc@30 (%) |",
-        "|---|--:|--:|--:|--:|--:|--:|",
-    ]
-    for (label, views, _), members in sorted(rows.items()):
-        pooled: dict[str, list[float]] = defaultdict(list)
-        for member in members:
-            for name, values in zip(member["instance_names"], member["errors_deg"], strict=True):
-                pooled[name] += values
-        errors = torch.tensor([e for v in pooled.values() for e in v], dtype=torch.float64)
-        instance = torch.tensor([i for i, v in enumerate(pooled.values()) for _ in v])
+            rows[what, job["views_per_instance"], result["label"]].append(result)
+    head = ["", "views", "seeds", "steps", "median error (°)", "Acc@15 (%)", "Acc@30 (%)"]
+    head += [f"less than “{against}” by (°)"] if against else []
+    lines = ["| " + " | ".join(head) + " |", "|---" + "|--:" * (len(head) - 1) + "|"]
+    for (what, views, label), members in sorted(rows.items()):
+        errors, instance = _pooled(members)
         cells = [_cell(instance_bootstrap(errors, instance), 1)]
         for limit in ACCURACY_DEG:
             inside = (errors < limit).double()
             cells.append(_cell(instance_bootstrap(inside, instance, statistic="mean"), 100))
+        if against:
+            cells.append(_compared(rows.get((what, views, against), []), members))
         steps = "/".join(map(str, sorted({m["steps"] for m in members})))
         seeds = len({m["job"]["seed"] for m in members})
         lines.append("| " + " | ".join([label, str(views), str(seeds), steps, *cells]) + " |")
     return "\n".join(lines)
+
+
+def _pooled(members: list[dict[str, Any]]) -> tuple[Tensor, Tensor]:
+    """Errors of all seeds and the instances that they belong to."""
+    pooled: dict[str, list[float]] = defaultdict(list)
+    for member in sorted(members, key=lambda m: m["job"]["seed"]):
+        for name, values in zip(member["instance_names"], member["errors_deg"], strict=True):
+            pooled[name] += values
+    errors = torch.tensor([e for v in pooled.values() for e in v], dtype=torch.float64)
+    return errors, torch.tensor([i for i, v in enumerate(pooled.values()) for _ in v])
+
+
+def _compared(baseline: list[dict[str, Any]], members: list[dict[str, Any]]) -> str:
+    seeds = {m["job"]["seed"] for m in baseline} & {m["job"]["seed"] for m in members}
+    if not seeds or baseline == members:
+        return ""
+    first, instance = _pooled([m for m in baseline if m["job"]["seed"] in seeds])
+    second, same = _pooled([m for m in members if m["job"]["seed"] in seeds])
+    if not torch.equal(instance, same):
+        return ""
+    return _cell(paired_median_difference(first, second, instance), 1)
 
 
 def _cell(interval: Interval, unit: float) -> str:
@@ -209,14 +231,15 @@ def _cell(interval: Interval, unit: float) -> str:
 
 
 def main() -> None:
-    """Print the table of the results below a folder (default: results)."""
+    """Print the table of the results below a folder, compared with the row of a label if given."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "results")
+    against = sys.argv[2] if len(sys.argv) > 2 else None
     results = collect(folder)
     if not results:
         sys.exit(
             f"error: no results below {folder}; a run leaves one with paths.results_dir={folder}"
         )
-    print(table(results))
+    print(table(results, against=against))
     scales = sorted({json.dumps([r["job"]["scale"], r["job"]["data"]]) for r in results})
     print(f"\n{len(results)} jobs; scale and source: {', '.join(scales)}")
 
