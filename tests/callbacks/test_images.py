@@ -58,6 +58,7 @@ def test_classes_are_drawn_without_meshes(tmp_path, events):
 
 def test_without_a_logger_nothing_happens(tmp_path):
     make_trainer(tmp_path, PredictionImages(), logger=False).fit(FakeTask(), datamodule=FakeData())
+    assert not list(tmp_path.rglob("events.out.tfevents.*"))
 
 
 def test_settings_are_checked_and_the_count_survives_a_resume():
