@@ -9,17 +9,18 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "i2i"
 SHARED = {"errors", "i2i"}  # may be imported by everybody
-DOORS = {"train", "evaluate", "predict", "render", "download"}
+DOORS = {"train", "evaluate", "predict", "render", "download", "report", "check"}
 ALLOWED = {
     "geometry": set(),
     "nn": {"geometry"},
     "metrics": {"geometry"},
     "rendering": {"geometry"},
-    "testing": {"geometry"},
+    "testing": {"geometry", "nn"},
     "models": {"nn", "geometry"},
     "data": {"geometry", "rendering"},
     "tasks": {"models", "nn", "metrics", "data.info"},
-    "runs": {"tasks", "data", "models", "metrics", "configuration"},
+    "runs": {"tasks", "data", "models", "metrics", "geometry", "configuration"},
+    "reports": {"runs", "metrics", "configuration", "data.info", "viz"},
 }  # fmt: skip
 
 

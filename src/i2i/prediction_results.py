@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from i2i.data.info import DataInfo
+from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.rendering.mesh import RenderMesh
 from i2i.viz.predictions import class_figure, pose_figure
 from i2i.viz.rerender import rerender
@@ -16,6 +18,9 @@ from i2i.viz.style import save_figure
 
 EULER_CONVENTION = "extrinsic xyz: rotation = Rz(c) @ Ry(b) @ Rx(a)"
 FRAME = "object to camera, x_camera = rotation @ x_object; camera x right, y up, z to the viewer"
+
+
+_NOT_TOLD_APART = {"z": "turns", "z2": "half turns"}
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,8 @@ class PoseResult:
 
     Attributes:
         class_name: Class of the object.
-        symmetry: ``"z"`` if rotations about the object's own z axis mean nothing, else ``"none"``.
+        symmetry: ``"z"`` or ``"z2"`` if turns or half turns about the object's own z axis mean
+            nothing, else ``"none"``.
         rotation: Shape (3, 3), object → camera (see `FRAME`).
         quaternion_xyzw: Shape (4,), the same rotation, scalar last.
         euler_deg: (a, b, c) in degrees, see `EULER_CONVENTION`.
@@ -84,8 +90,9 @@ class PoseResult:
         lines.append(f"quaternion xyzw {x:+.4f} {y:+.4f} {z:+.4f} {w:+.4f}")
         a, b, c = self.euler_deg
         lines.append(f"Euler           {a:+.1f}° {b:+.1f}° {c:+.1f}°  ({EULER_CONVENTION})")
-        if self.symmetry == "z":
-            lines.append("symmetry        turns about the object's own z axis are not told apart")
+        if self.symmetry in _NOT_TOLD_APART:
+            turns = _NOT_TOLD_APART[self.symmetry]
+            lines.append(f"symmetry        {turns} about the object's own z axis are not told apart")
         if self.confidence is not None:
             lines.append(f"confidence      {self.confidence:.1%}")
         lines += [
@@ -143,12 +150,9 @@ class PoseResult:
         return save_figure(figure, path)
 
     def _apart_deg(self, other: Alternative) -> float:
-        """Angle between an alternative and the answer (of the z axes under symmetry)."""
-        if self.symmetry == "z":
-            cosine = self.rotation[:, 2] @ other.rotation[:, 2]
-        else:
-            cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
-        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        """Angle between an alternative and the answer, the smallest that the symmetry allows."""
+        a, b = torch.from_numpy(self.rotation), torch.from_numpy(other.rotation)
+        return float(torch.rad2deg(symmetric_angle_rad(a.double(), b.double(), self.symmetry)))
 
 
 @dataclass(frozen=True)

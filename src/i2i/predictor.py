@@ -16,12 +16,8 @@ from i2i.data.photographs import PreparedImage, prepare_photograph
 from i2i.data.pictures import Picture
 from i2i.errors import CheckpointError, ConfigurationError
 from i2i.geometry.cameras import Camera
-from i2i.geometry.rotations import (
-    euler_deg_from_rotation,
-    geodesic_angle_rad,
-    quaternion_xyzw_from_rotation,
-    z_axis_angle_rad,
-)
+from i2i.geometry.rotations import euler_deg_from_rotation, quaternion_xyzw_from_rotation
+from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.models.prediction import PosePrediction
 from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
@@ -254,8 +250,8 @@ def _distinct_answers(
 
     Several candidates may stand for one rotation (neighbouring group elements whose residuals
     meet): each candidate's mass goes to the first answer within `SAME_ANSWER_DEG` of it, going
-    through the candidates from the most probable to the least. For a class with an axis of
-    symmetry, only the direction of the axis tells answers apart.
+    through the candidates from the most probable to the least. Answers that look the same by the
+    symmetry of the class are one.
 
     Returns:
         Empty for a network without a distribution.
@@ -265,14 +261,13 @@ def _distinct_answers(
     candidates = prediction.candidates.double().cpu()
     candidates = candidates if candidates.ndim == 3 else candidates[0]  # (K, 3, 3)
     mass = prediction.log_prob[0].double().exp().cpu()
-    angle = z_axis_angle_rad if symmetry == "z" else geodesic_angle_rad
     answers, free = [], torch.ones(len(mass), dtype=torch.bool)
     order = torch.argsort(mass, descending=True, stable=True).tolist()
     centers = [best, *(candidates[index] for index in order)]
     for number, center in enumerate(centers):
         if number and not free[order[number - 1]]:
             continue
-        same = free & (torch.rad2deg(angle(candidates, center.expand_as(candidates)))
+        same = free & (torch.rad2deg(symmetric_angle_rad(candidates, center, symmetry))
                        <= SAME_ANSWER_DEG)  # fmt: skip
         answers.append((center, float(mass[same].sum())))
         free &= ~same

@@ -1,12 +1,18 @@
 """Train and test one network: `python -m i2i.train model=i2i task=pose data=shapenet_bed`."""
 
+import gc
 import logging
+import multiprocessing
+import os
 import shlex
 import sys
+import traceback
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -21,12 +27,15 @@ from i2i.callbacks.steps import StopAfterSteps
 from i2i.cli import door, given_overrides, refuse
 from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
-from i2i.errors import ConfigurationError
+from i2i.errors import ConfigurationError, I2IError
 from i2i.finishing import finish
 from i2i.runs.building import build_datamodule, build_task, follow_root
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
 from i2i.runs.identity import config_hash
 from i2i.runs.loading import load_weights, read_checkpoint
+from i2i.runs.locks import holder, job_lock
+from i2i.runs.progress import find_broken, find_done
+from i2i.sweeping import JobFailedError, one_line
 from i2i.tasks.base import Task
 
 log = logging.getLogger(__name__)
@@ -36,6 +45,8 @@ _WITH_RESUME = (
     "resume", "run=", "trainer.accelerator", "trainer.devices", "trainer.strategy",
     "trainer.enable_", "data.root", "data.store_root", "data.num_workers",
 )  # fmt: skip
+LOCKS = ".locks"
+"""Folder of the jobs' locks, below the folder of the runs."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +76,49 @@ def train(cfg: DictConfig) -> RunResult:
         ConfigurationError: if parts of the configuration do not fit together.
     """
     register_resolvers()
-    folder = RunFolder(_run_dir(cfg))
+    folder = RunFolder(Path(cfg.run_dir))
     if cfg.resume:
         cfg = _resumed(cfg, folder)
+    identity = config_hash(plain(cfg))
+    runs_dir = Path(cfg.paths.runs_dir)
+    with ExitStack() as stack:
+        if folder.path.resolve().parent == runs_dir.resolve():
+            # Only told, not asked: a sweep leaves this job alone while it runs.
+            stack.enter_context(job_lock(runs_dir / LOCKS, identity))
+        return _train(cfg, folder, identity)
+
+
+def train_in_sweep(cfg: DictConfig) -> RunResult | None:
+    """One job of a sweep: begin it, go on with a broken run of it, or leave it to who runs it.
+
+    Args:
+        cfg: The composed configuration of the job.
+
+    Returns:
+        What the run gave; None where there was nothing to do.
+    """
+    register_resolvers()
+    if cfg.resume:
+        return train(cfg)
     config = plain(cfg)
     identity = config_hash(config)
-    seed_everything(cfg.seed, workers=True, verbose=False)
+    locks = Path(cfg.paths.runs_dir) / LOCKS
+    with job_lock(locks, identity) as ours:
+        if not ours:
+            print(f"skipped: {holder(locks, identity)} is running this job", flush=True)
+            return None
+        if done := find_done(config, identity):  # since the sweep was planned
+            print(f"skipped: done already ({done})", flush=True)
+            return None
+        broken = find_broken(config, identity)
+        cfg.resume = str(broken) if broken else None
+        cfg.run_dir = str(broken or f"{config['run_dir']}-{identity[:8]}")
+        return _train(cfg, RunFolder(Path(cfg.run_dir)), identity)
 
+
+def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
+    config = plain(cfg)
+    seed_everything(cfg.seed, workers=True, verbose=False)
     datamodule = build_datamodule(cfg)
     trainer = _trainer(cfg, folder)
     if trainer.is_global_zero:
@@ -89,11 +136,6 @@ def train(cfg: DictConfig) -> RunResult:
 
 def _in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-
-
-def _run_dir(cfg: DictConfig) -> Path:
-    """Hydra's folder for a job of a sweep, else the one that the configuration names."""
-    return Path(HydraConfig.get().runtime.output_dir if _in_sweep() else cfg.run_dir)
 
 
 def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
@@ -166,7 +208,7 @@ def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
 
 def _open(folder: RunFolder, config: dict[str, Any], identity: str, *, resumed: bool) -> None:
     if not resumed:
-        if folder.config.exists():
+        if folder.config.exists() and not _in_sweep():  # there: a run that got nowhere
             raise ConfigurationError(
                 f"{folder.path} holds a run already: go on with it by resume={folder.path}, or "
                 "choose another run_name"
@@ -220,11 +262,62 @@ def _print_metrics(metrics: dict[str, float], run_dir: Path) -> None:
         print(f"figure {figure}")
 
 
+def _job_of_a_sweep(cfg: DictConfig) -> None:
+    """Run one job, and leave nothing of it in this process, which may have others to run.
+
+    Raises:
+        JobFailedError: with the reason alone: a traceback would keep alive what the job held.
+    """
+    words = [word for word in given_overrides() if not word.startswith("experiment=")]
+    print(f"\njob {HydraConfig.get().job.num}: {' '.join(words)}", flush=True)
+    if multiprocessing.get_start_method(allow_none=True) == "loky":
+        # Joblib's processes cannot start others in its own way, as rendering must.
+        multiprocessing.set_start_method(None, force=True)
+    reason = ""
+    try:
+        result = train_in_sweep(cfg)
+        if result is not None:
+            _print_metrics(result.metrics, result.run_dir)
+    except Exception as error:
+        reason = one_line(error)
+        if (
+            not isinstance(error, I2IError | ValueError | OSError)
+            or "HYDRA_FULL_ERROR" in os.environ
+        ):
+            traceback.print_exc()
+    result = None
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+    gc.collect()
+    torch.cuda.empty_cache()
+    if reason:
+        print(f"failed: {reason}", file=sys.stderr, flush=True)
+        raise JobFailedError(reason)
+
+
+def refuse_table() -> None:
+    """Refuse a table without -m: it would be a single run with the settings of none of its jobs.
+
+    Raises:
+        ConfigurationError: with the command that runs the table.
+    """
+    if HydraConfig.initialized() and HydraConfig.get().sweeper.get("grids"):
+        words = shlex.join(given_overrides())
+        raise ConfigurationError(
+            f"this experiment is a sweep of many jobs: python -m i2i.train -m {words}"
+        )
+
+
 @door("train")
 def main(cfg: DictConfig) -> None:
     """Train and test one network, or every job of a sweep."""
+    register_resolvers()  # a launcher may have started this process
     if cfg.print_config:
         print(OmegaConf.to_yaml(cfg, resolve=True))
+    if _in_sweep():
+        _job_of_a_sweep(cfg)
+        return
+    refuse_table()
     result = train(cfg)
     _print_metrics(result.metrics, result.run_dir)
 

@@ -174,7 +174,7 @@ def test_renderers_agree_with_another_camera(embree, pyrender, wedge, rotations)
 def test_unknown_names_are_refused_with_the_list(embree, wedge, rotations):
     with pytest.raises(ValueError, match="embree, pyrender"):
         get_renderer("blender2")
-    assert renderer_names() == ("embree", "pyrender")
+    assert renderer_names() == ("embree", "pyrender", "blender")
     with pytest.raises(ValueError, match="gray, depth, rgb"):
         embree.render(wedge, rotations, modality="colour")
 

@@ -1,6 +1,7 @@
 """Figures of a test: each prediction beside its own image."""
 
 import numpy as np
+import torch
 import trimesh
 
 from i2i.data.info import DataInfo
@@ -14,9 +15,10 @@ class FakeDataset:
     instance_id = np.array([1, 1, 1, 0, 0, 0])
     view_id = np.array([0, 1, 2, 0, 1, 2])
 
-    def raw_images(self, indices):
+    def __getitems__(self, indices):
         brightness = [10 * (3 * self.instance_id[i] + self.view_id[i]) for i in indices]
-        return np.stack([np.full((1, 8, 8), value, np.uint8) for value in brightness])
+        images = torch.tensor(brightness)[:, None, None, None].expand(-1, 1, 8, 8)
+        return {"image": images / 255.0}
 
 
 class FakeData:

@@ -1,5 +1,6 @@
 """Lightning callbacks: pictures, error histograms, final metrics, guards, per-image records."""
 
+from i2i.callbacks.distributions import DistributionImages
 from i2i.callbacks.errors import ErrorHistogram
 from i2i.callbacks.guard import NonFiniteLossGuard
 from i2i.callbacks.hparams import HyperparameterMetrics
@@ -8,6 +9,7 @@ from i2i.callbacks.record import PredictionRecord
 from i2i.callbacks.steps import StopAfterSteps
 
 __all__ = [
+    "DistributionImages",
     "ErrorHistogram",
     "HyperparameterMetrics",
     "NonFiniteLossGuard",

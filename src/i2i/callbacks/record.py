@@ -16,8 +16,9 @@ class PredictionRecord(Callback):
     """Collects per-image test predictions and writes one npz, in the order of the test set.
 
     The arrays of a pose run: `rotation_true`, `rotation_pred` (N, 3, 3), `error_deg`,
-    `element_probability`, `class_id`, `instance_id`, `view_id` (N,); of a classification run
-    `logits` (N, C) and `descriptor` (N, D) instead of the rotations.
+    `element_probability`, `class_id`, `instance_id`, `view_id` (N,), and what the task hands on for
+    each image, such as `group_correct` and `log_likelihood` (N,); of a classification run `logits`
+    (N, C) and `descriptor` (N, D) instead of the rotations.
 
     Args:
         path: The file to write; None keeps the arrays in `.arrays` only.
@@ -47,8 +48,7 @@ class PredictionRecord(Callback):
             kept["error_deg"] = error_deg(prediction.rotation, batch["rotation"])
             if prediction.log_prob is not None:
                 kept["element_probability"] = prediction.log_prob.max(dim=-1).values.exp()
-            if outputs.get("group_correct") is not None:
-                kept["group_correct"] = outputs["group_correct"]
+            kept |= {k: v for k, v in outputs.items() if k not in ("prediction", "batch")}
         else:
             kept["logits"] = prediction.logits
             kept["descriptor"] = prediction.descriptor

@@ -20,7 +20,7 @@ from i2i.data.sources.base import MeshItem, MeshSource, override_symmetry
 from i2i.data.splits import Splits, class_modes, split_items
 from i2i.data.store import RenderedStore
 from i2i.geometry.cameras import Camera
-from i2i.geometry.rotations import strip_z_symmetry
+from i2i.geometry.symmetries import strip_symmetry
 from i2i.rendering.base import Renderer
 from i2i.rendering.mesh import RenderMesh
 
@@ -278,9 +278,10 @@ class RenderedDataModule(ImageDataModule):
         )
 
     def _labels(self, rotations: np.ndarray, class_id: int) -> np.ndarray:
-        """Rotation labels, shape (N, 3, 3), float32; without rotation about z where it applies."""
-        if self.strip_symmetry and self.symmetry[class_id] == "z" and len(rotations):
-            rotations = strip_z_symmetry(torch.from_numpy(rotations)).numpy()
+        """Rotation labels, shape (N, 3, 3), float32; one for all that look the same."""
+        if self.strip_symmetry and len(rotations):
+            labels = strip_symmetry(torch.from_numpy(rotations), self.symmetry[class_id])
+            rotations = labels.numpy()
         return rotations.astype(np.float32)
 
 

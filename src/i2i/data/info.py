@@ -9,8 +9,8 @@ from typing import Any
 CHANNELS = {"gray": 1, "depth": 1, "rgb": 3}
 """Image channels of each modality."""
 
-SYMMETRIES = ("none", "z")
-"""Symmetries that a class can have: none, or continuous about the object's z axis."""
+SYMMETRIES = ("none", "z", "z2")
+"""Symmetries that a class can have: none, any turn about its z axis, or the half turn about it."""
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class DataInfo:
 
     Attributes:
         class_names: Names of the classes; ``class_id`` in a batch is the index into it.
-        symmetry: ``"none"`` or ``"z"`` (continuous about the object's z axis) for each class, in
-            the same order; a property of the class, whether or not its labels were stripped.
+        symmetry: ``"none"``, ``"z"`` (any turn about the object's z axis) or ``"z2"`` (half turns)
+            for each class, in the same order; a property of the class, whether or not its labels were stripped.
         channels: Image channels (1 for gray and depth, 3 for rgb).
         image_size: Height and width of the images, in pixels.
         modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
@@ -28,7 +28,7 @@ class DataInfo:
         camera_distance: Distance from the camera to the object's centre, in object radii.
         camera_fov_deg: Full field of view in both directions, in degrees.
         source: Name of the mesh source.
-        symmetry_stripped: Whether the labels of the ``"z"`` classes lost their rotation about z.
+        symmetry_stripped: Whether rotations that look the same have one label.
 
     Example:
         >>> info = DataInfo(("desk",), ("none",), channels=1, image_size=64, modality="gray")
@@ -55,7 +55,7 @@ class DataInfo:
         if len(self.symmetry) != len(self.class_names):
             raise ValueError(
                 f"{len(self.class_names)} class names but {len(self.symmetry)} symmetries: "
-                "give one of 'none' or 'z' for each class."
+                "give one of 'none', 'z' or 'z2' for each class."
             )
         for name in self.symmetry:
             if name not in SYMMETRIES:

@@ -18,7 +18,7 @@ from i2i.data.images import LabelledImages, read_labelled_images
 from i2i.data.info import CHANNELS, DataInfo
 from i2i.data.loaders import ImageDataModule, LoaderSettings, SplitData
 from i2i.errors import ImageError
-from i2i.geometry.rotations import strip_z_symmetry
+from i2i.geometry.symmetries import strip_symmetry
 
 SPLITS = ("train", "val", "test")
 
@@ -158,9 +158,9 @@ class LabelledImagesDataModule(ImageDataModule):
     def _labels(self, content: LabelledImages) -> np.ndarray:
         """Rotation labels, shape (N, 3, 3), float32."""
         labels = np.array(content.rotations, np.float64)
-        symmetric = np.array([value == "z" for value in self.info.symmetry])[content.class_ids]
-        if self.strip_symmetry and symmetric.any():
-            labels[symmetric] = strip_z_symmetry(torch.from_numpy(labels[symmetric])).numpy()
+        for class_id, symmetry in enumerate(self.info.symmetry if self.strip_symmetry else ()):
+            mine = content.class_ids == class_id
+            labels[mine] = strip_symmetry(torch.from_numpy(labels[mine]), symmetry).numpy()
         return labels.astype(np.float32)
 
     def _parts(self, files: Sequence[str]) -> np.ndarray:

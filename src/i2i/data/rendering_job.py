@@ -38,7 +38,7 @@ from i2i.data.store import (
 )
 from i2i.errors import MeshError, RendererUnavailableError, StoreError
 from i2i.geometry.cameras import Camera
-from i2i.rendering.base import Renderer, get_renderer
+from i2i.rendering.base import Renderer, canonical_name, get_renderer
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,8 @@ def store_settings(
         raise ValueError(f"data.modality={modality} is not known. Allowed: {', '.join(CHANNELS)}.")
     if image_size < 1:
         raise ValueError(f"data.image_size={image_size} is not allowed: give at least 1 pixel.")
-    name, version = (renderer, None) if isinstance(renderer, str) else (renderer.name, None)
+    name = canonical_name(renderer) if isinstance(renderer, str) else renderer.name
+    version = None
     # A finished store can be used where its renderer is not installed.
     with contextlib.suppress(RendererUnavailableError):
         instance = get_renderer(renderer) if isinstance(renderer, str) else renderer

@@ -34,7 +34,7 @@ class StoreSettings:
     Attributes:
         source: Name of the mesh source.
         up_axis: Axis of its meshes that points up.
-        renderer: Name of the renderer.
+        renderer: Name of the renderer, with its options if it has any.
         renderer_version: Its version; None if it is not installed, then it is not compared.
         camera_distance: Distance from the camera to the object's centre, in object radii.
         camera_fov_deg: Full field of view, in degrees.
@@ -58,7 +58,8 @@ class StoreSettings:
         """Folder name of these settings; versions are left out, they are checked in the card."""
         fixed = {**asdict(self), "renderer_version": None, "schema": SCHEMA_VERSION}
         digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:8]
-        return f"{self.modality}_{self.image_size}px_{self.renderer}_{digest}"
+        name = self.renderer.partition(":")[0]  # its options are in the digest
+        return f"{self.modality}_{self.image_size}px_{name}_{digest}"
 
     def folder(self, root: str | os.PathLike[str], class_name: str, split: str) -> Path:
         """Folder of the store of one class and split."""

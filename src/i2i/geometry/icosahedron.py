@@ -1,13 +1,14 @@
-"""The icosahedron with a vertex towards the viewer, and its 60 rotations as integer tables.
+"""The icosahedron with a vertex or an edge towards the viewer, and its 60 rotations as tables.
 
 Orders are part of the checkpoint format, and a test pins them by checksum:
 
 - Vertices: the 12 corners, then the 30 midpoints of level 1, then the 120 of level 2; inside each
   batch by falling z, then by rising azimuth in [0, 2π), both compared after rounding to 1e-6. So
-  vertex 0 is on +z, and vertices 1–5 are the upper ring, vertex 1 at azimuth 0.
+  with a vertex towards the viewer, vertex 0 is on +z, and vertices 1–5 are the upper ring, vertex 1
+  at azimuth 0; with an edge towards the viewer, corner 0 is its upper end and corner 1 its lower.
 - Rotations: by the number of the corner to which corner 0 goes, then of that to which corner 1 goes
-  (two adjacent corners fix a rotation). So element 0 is the identity, elements 0–4 are the
-  turns about the viewing axis by 0°, 72°, ..., 288°.
+  (two adjacent corners fix a rotation). So element 0 is the identity; with a vertex towards the
+  viewer, elements 0–4 are the turns about the viewing axis by 0°, 72°, ..., 288°.
 """
 
 import hashlib
@@ -24,6 +25,7 @@ from torch import Tensor
 from i2i.geometry.rotations import geodesic_angle_rad
 
 Frame = Literal["conjugated", "standard"]
+MeshAxis = Literal["vertex", "twofold"]
 
 _GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 _ROUND = 6  # decimals in comparisons: far above float noise, far below any real difference (> 0.1)
@@ -34,17 +36,19 @@ _MAX_LEVEL = 2
 class Icosahedron:
     """Vertices, group and action tables; made by `icosahedron`, shared, never to be written to.
 
-    V = 12, 42, 162 vertices and V_half = 6, 16, 71 visible ones at level 0, 1, 2.
+    V = 12, 42, 162 vertices and V_half = 6, 16, 71 visible ones at level 0, 1, 2, or with the edge
+    towards the viewer V_half = 4, 17, 73.
 
     Attributes:
         level: Number of subdivisions.
         frame: Which matrices the 60 elements have, see `icosahedron`.
         normalize_midpoints: Whether midpoints are pushed out to the unit sphere.
-        vertices: Positions with vertex 0 on +z and vertex 1 at azimuth 0, shape (V, 3), float64.
+        mesh_axis: What is towards the viewer, see `icosahedron`.
+        vertices: Positions, shape (V, 3), float64.
         vertex_level: Subdivision that made each vertex, shape (V,), int64.
         faces: Triangles, counter-clockwise seen from outside, shape (20·4^level, 3), int64.
         tilt: Rotation A from the standard orientation, with corners (0, ±1, ±φ) and their cyclic
-            permutations, to that of ``vertices``, shape (3, 3), float64.
+            permutations, to that of ``vertices``, shape (3, 3), float64; the identity for twofold.
         rotations: The 60 matrices, shape (60, 3, 3), float64.
         multiplication: ``rotations[multiplication[g, h]] = rotations[g] @ rotations[h]``, shape
             (60, 60), int64.
@@ -59,6 +63,7 @@ class Icosahedron:
     level: int
     frame: Frame
     normalize_midpoints: bool
+    mesh_axis: MeshAxis
     vertices: Tensor
     vertex_level: Tensor
     faces: Tensor
@@ -85,15 +90,41 @@ class Icosahedron:
         return self.vertices[self.visible, :2].clone()
 
     @cached_property
-    def visible_permutation(self) -> Tensor:
-        """How the five turns about the viewing axis permute the half mesh, (5, V_half), int64.
+    def marks(self) -> Tensor:
+        """Where each element takes a mark on the first edge, shape (60, 3), float64.
 
-        Entry [k, i] is the position in ``visible`` of the vertex to which the turn by 72°·k takes
-        ``visible[i]``.
+        The mark of the identity is on the edge from corner 0 to corner 1, a third of the way. No
+        other rotation keeps it, so the marks stand for the elements; they are the corners of a
+        football (truncated icosahedron). ``rotations[g] @ marks[h] = marks[multiplication[g, h]]``
+        in the conjugated frame.
         """
+        first, second = (self.vertices[self.action[:, corner]] for corner in (0, 1))
+        return (2 * first + second) / 3
+
+    @cached_property
+    def viewing_turns(self) -> Tensor:
+        """Elements that take the half mesh to itself, rising, identity first, int64.
+
+        They are the turns about the viewing axis: 5 by multiples of 72°, or 2 by 0° and 180°.
+        """
+        position = self._position_in_half
+        return torch.nonzero((position[self.action[:, self.visible]] >= 0).all(dim=1)).flatten()
+
+    @cached_property
+    def visible_permutation(self) -> Tensor:
+        """How the turns about the viewing axis permute the half mesh, (5 or 2, V_half), int64.
+
+        Entry [k, i] is the position in ``visible`` of the vertex to which the turn by 72°·k (or
+        180°·k) takes ``visible[i]``.
+        """
+        return self._position_in_half[self.action[self.viewing_turns][:, self.visible]]
+
+    @cached_property
+    def _position_in_half(self) -> Tensor:
+        """Position of each vertex in ``visible``, −1 for the others, shape (V,)."""
         position = torch.full((len(self.vertices),), -1)
         position[self.visible] = torch.arange(len(self.visible))
-        return position[self.action[:5, self.visible]]
+        return position
 
     @cached_property
     def angles_rad(self) -> Tensor:
@@ -119,14 +150,19 @@ class Icosahedron:
 
     def __repr__(self) -> str:
         midpoints = "normalised" if self.normalize_midpoints else "as cut"
+        axis = "" if self.mesh_axis == "vertex" else f", {self.mesh_axis} axis to the viewer"
         return (
             f"Icosahedron(level={self.level}: V{len(self.vertices)}, "
-            f"half mesh {len(self.visible)}, I60 {self.frame}, midpoints {midpoints})"
+            f"half mesh {len(self.visible)}, I60 {self.frame}, midpoints {midpoints}{axis})"
         )
 
 
 def icosahedron(
-    level: int = 1, frame: Frame = "conjugated", *, normalize_midpoints: bool = False
+    level: int = 1,
+    frame: Frame = "conjugated",
+    *,
+    normalize_midpoints: bool = False,
+    mesh_axis: MeshAxis = "vertex",
 ) -> Icosahedron:
     """The icosahedron at a subdivision level; built once per process and shared.
 
@@ -143,12 +179,17 @@ def icosahedron(
         normalize_midpoints: Push midpoints out to the unit sphere, after each subdivision. Off:
             they stay on the edges (radius 0.8507 at level 1), as in the paper. The numbering is the
             same.
+        mesh_axis: What points to the viewer. "vertex": a corner, as in the paper; the half mesh has
+            the five turns about it, of which the pixel grid has none but the identity. "twofold":
+            the middle of an edge, upright in the picture (the standard orientation itself); the
+            half mesh and the pixel grid then share the half turn. Numbers of vertices and elements
+            mean other things than with "vertex": weights fit one of them only.
 
     Returns:
         The icosahedron.
 
     Raises:
-        ValueError: If the level or the frame is another.
+        ValueError: If the level, the frame or the axis is another.
 
     Example:
         >>> icosahedron(1)
@@ -158,7 +199,9 @@ def icosahedron(
         raise ValueError(f"icosahedron level {level!r} is not one of 0, 1, 2")
     if frame not in get_args(Frame):
         raise ValueError(f"frame {frame!r} is not one of {', '.join(get_args(Frame))}")
-    return _build(level, frame, bool(normalize_midpoints))
+    if mesh_axis not in get_args(MeshAxis):
+        raise ValueError(f"mesh_axis {mesh_axis!r} is not one of {', '.join(get_args(MeshAxis))}")
+    return _build(level, frame, bool(normalize_midpoints), mesh_axis)
 
 
 def nearest_element(target: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
@@ -187,9 +230,9 @@ def compose(residual: Tensor, element: Tensor) -> Tensor:
     return residual @ element
 
 
-@lru_cache(maxsize=12)  # every combination there is
-def _build(level: int, frame: Frame, normalize_midpoints: bool) -> Icosahedron:
-    tilt = _tilt()
+@lru_cache(maxsize=24)  # every combination there is
+def _build(level: int, frame: Frame, normalize_midpoints: bool, mesh_axis: MeshAxis) -> Icosahedron:
+    tilt = _tilt() if mesh_axis == "vertex" else np.eye(3)
     corners = _standard_corners() @ tilt.T
     corners = corners[_order(corners)]
     as_cut, faces, batch = _subdivide(corners, level, normalize=False)
@@ -205,6 +248,7 @@ def _build(level: int, frame: Frame, normalize_midpoints: bool) -> Icosahedron:
         level=level,
         frame=frame,
         normalize_midpoints=normalize_midpoints,
+        mesh_axis=mesh_axis,
         vertices=torch.from_numpy(vertices),
         vertex_level=torch.from_numpy(batch),
         faces=torch.from_numpy(_outward(faces, as_cut)),

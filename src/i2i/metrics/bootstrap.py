@@ -24,7 +24,7 @@ class Interval:
     num_instances: int
 
 
-def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
+def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
     """Averaging median of `values` (N,) where sample i counts weights[r, i] times: (R,)."""
     order = values.argsort()
     cumulative = weights[:, order].cumsum(dim=1)  # (R, N)
@@ -42,7 +42,7 @@ def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
 
 
 _STATISTICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "median": _weighted_median,
+    "median": weighted_median,
     "mean": _weighted_mean,
 }
 
@@ -86,12 +86,12 @@ def instance_bootstrap(
     values = values.double().cpu()
     unique, member = instance_id.cpu().unique(return_inverse=True)
     num_instances = len(unique)
-    counts = _resampled_counts(num_instances, num_resamples, seed)
+    counts = resampled_counts(num_instances, num_resamples, seed)
 
     rows = max(1, chunk_elements // len(values))
     resampled = torch.cat([function(values, chunk[:, member]) for chunk in counts.split(rows)])
     value = function(values, torch.ones(1, len(values), dtype=torch.int64))
-    return _interval(value.item(), resampled, level, num_instances)
+    return percentile_interval(value.item(), resampled, level, num_instances)
 
 
 def paired_median_difference(
@@ -122,13 +122,13 @@ def paired_median_difference(
     """
     first, second = first.double().cpu(), second.double().cpu()
     unique, member = instance_id.cpu().unique(return_inverse=True)
-    weights = _resampled_counts(len(unique), num_resamples, seed)[:, member]
-    resampled = _weighted_median(first, weights) - _weighted_median(second, weights)
+    weights = resampled_counts(len(unique), num_resamples, seed)[:, member]
+    resampled = weighted_median(first, weights) - weighted_median(second, weights)
     value = first.quantile(0.5) - second.quantile(0.5)
-    return _interval(value.item(), resampled, level, len(unique))
+    return percentile_interval(value.item(), resampled, level, len(unique))
 
 
-def _resampled_counts(num_instances: int, num_resamples: int, seed: int) -> Tensor:
+def resampled_counts(num_instances: int, num_resamples: int, seed: int) -> Tensor:
     """How often each instance is drawn in each resample: (R, I)."""
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(num_instances, (num_resamples, num_instances), generator=generator)
@@ -136,7 +136,10 @@ def _resampled_counts(num_instances: int, num_resamples: int, seed: int) -> Tens
     return counts.scatter_add_(1, drawn, torch.ones_like(drawn))
 
 
-def _interval(value: float, resampled: Tensor, level: float, num_instances: int) -> Interval:
+def percentile_interval(
+    value: float, resampled: Tensor, level: float, num_instances: int
+) -> Interval:
+    """The central part of resampled statistics (R,), around the statistic of the sample itself."""
     tail = (1 - level) / 2
     low, high = torch.quantile(resampled, torch.tensor([tail, 1 - tail], dtype=torch.float64))
     return Interval(value, low.item(), high.item(), num_instances)

@@ -9,6 +9,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from i2i.geometry.rotations import geodesic_angle_rad
+from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.metrics.bootstrap import Interval, instance_bootstrap
 
 FLIP_DEG = 150.0
@@ -24,16 +25,6 @@ def error_deg(prediction: Tensor, target: Tensor) -> Tensor:
         180.0
     """
     return torch.rad2deg(geodesic_angle_rad(prediction.double(), target.double()))
-
-
-def axis_error_deg(prediction: Tensor, target: Tensor) -> Tensor:
-    """Angle between the directions of the object's z axis in the camera, in degrees: (...,).
-
-    The error that counts for an object that looks the same from all sides of its z axis.
-    """
-    a, b = prediction.double()[..., :, 2], target.double()[..., :, 2]
-    sine = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1)
-    return torch.rad2deg(torch.atan2(sine, (a * b).sum(dim=-1)))
 
 
 def pose_scores(errors: Tensor) -> dict[str, Tensor]:
@@ -53,12 +44,12 @@ class PoseErrors(Metric):
 
     `compute()` gives `median_error_deg`, `mean_error_deg`, `acc_at_15deg`, `acc_at_30deg`,
     `flip_rate` (beyond 150°) and, where it was told, `group_accuracy`; each as `<class>/<score>`;
-    `mean_class_median_error_deg`, the paper's average; and `<class>/median_axis_error_deg` for
-    classes with a z symmetry.
+    `mean_class_median_error_deg`, the paper's average; and `<class>/median_symmetric_error_deg`,
+    the error to the nearest rotation that looks the same, for classes with a symmetry.
 
     Args:
         class_names: Names by class id.
-        symmetry: `"none"` or `"z"` for each class; all `"none"` when left out.
+        symmetry: `"none"`, `"z"` or `"z2"` for each class; all `"none"` when left out.
         **options: Of `torchmetrics.Metric`, such as `sync_on_compute=False`.
 
     Example:
@@ -73,7 +64,7 @@ class PoseErrors(Metric):
     full_state_update = False
 
     errors: list[Tensor]
-    axis_errors: list[Tensor]
+    symmetric_errors: list[Tensor]
     class_ids: list[Tensor]
     instance_ids: list[Tensor]
     group_flags: list[Tensor]
@@ -92,7 +83,7 @@ class PoseErrors(Metric):
                 f"{len(self.class_names)} classes and {len(self.symmetry)} symmetries: "
                 "give one for each class"
             )
-        for name in ("errors", "axis_errors", "class_ids", "instance_ids", "group_flags"):
+        for name in ("errors", "symmetric_errors", "class_ids", "instance_ids", "group_flags"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(
@@ -116,11 +107,22 @@ class PoseErrors(Metric):
         prediction, target = prediction.detach(), target.detach()
         zeros = torch.zeros(len(target), dtype=torch.int64, device=target.device)
         self.errors.append(error_deg(prediction, target))
-        self.axis_errors.append(axis_error_deg(prediction, target))
-        self.class_ids.append(zeros if class_id is None else class_id)
+        class_id = zeros if class_id is None else class_id
+        self.symmetric_errors.append(self._symmetric_error_deg(prediction, target, class_id))
+        self.class_ids.append(class_id)
         self.instance_ids.append(zeros if instance_id is None else instance_id)
         if group_correct is not None:
             self.group_flags.append(group_correct)
+
+    def _symmetric_error_deg(self, prediction: Tensor, target: Tensor, class_id: Tensor) -> Tensor:
+        errors = torch.zeros(len(target), dtype=torch.float64, device=target.device)
+        for index, symmetry in enumerate(self.symmetry):
+            mine = class_id == index
+            angle = symmetric_angle_rad(
+                prediction[mine].double(), target[mine].double(), symmetry
+            )
+            errors[mine] = torch.rad2deg(angle)
+        return errors
 
     def compute(self) -> dict[str, Tensor]:
         """The scores, see the class."""
@@ -138,9 +140,9 @@ class PoseErrors(Metric):
             medians.append(of_class["median_error_deg"])
             if flags is not None:
                 of_class["group_accuracy"] = flags[mine].mean()
-            if self.symmetry[index] == "z":
-                axis = dim_zero_cat(self.axis_errors)[mine]
-                of_class["median_axis_error_deg"] = axis.quantile(0.5)
+            if self.symmetry[index] != "none":
+                symmetric = dim_zero_cat(self.symmetric_errors)[mine]
+                of_class["median_symmetric_error_deg"] = symmetric.quantile(0.5)
             scores |= {f"{name}/{key}": value for key, value in of_class.items()}
         scores["mean_class_median_error_deg"] = torch.stack(medians).mean()
         return scores

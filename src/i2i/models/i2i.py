@@ -1,11 +1,12 @@
 """I2I: encoder, projector, icosahedral group convolution and head, for pose and for class."""
 
+import inspect
 from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
 
-from i2i.geometry.icosahedron import Frame, icosahedron
+from i2i.geometry.icosahedron import Frame, MeshAxis, icosahedron
 from i2i.models.prediction import ClassPrediction, PosePrediction
 from i2i.nn.encoders import check_encoder
 from i2i.nn.heads import (
@@ -32,7 +33,8 @@ class I2ITrunk(nn.Module):
             must have `out_channels` and `map_size`.
         projector: Called as `projector(in_channels, out_channels, map_size=...)`.
         group_conv: Called as `group_conv(out_features=..., num_spheres=...)`; its
-            `filter_channels` is what the projector gives.
+            `filter_channels` is what the projector gives. One that names a parameter
+            `in_channels` is told the encoder's width.
         channels: Channels of the image.
         image_size: Side of the image in pixels.
         out_features: Outputs for each group element.
@@ -40,7 +42,7 @@ class I2ITrunk(nn.Module):
 
     Raises:
         TypeError: If the encoder lacks an attribute.
-        ValueError: If projector and group convolution have meshes of different levels.
+        ValueError: If projector and group convolution do not fit each other.
     """
 
     def __init__(
@@ -58,19 +60,36 @@ class I2ITrunk(nn.Module):
         if not isinstance(encoder, nn.Module):
             encoder = encoder(in_channels=channels, image_size=image_size)
         self.encoder = check_encoder(encoder)
-        self.group_conv = group_conv(out_features=out_features, num_spheres=num_spheres)
+        told = {}
+        if "in_channels" in inspect.signature(group_conv).parameters:
+            told["in_channels"] = self.encoder.out_channels
+        self.group_conv = group_conv(out_features=out_features, num_spheres=num_spheres, **told)
         self.projector = projector(
             self.encoder.out_channels,
             self.group_conv.filter_channels,
             map_size=self.encoder.map_size,
         )
-        given = getattr(self.projector, "num_vertices", None)
-        wanted = getattr(self.group_conv, "num_vertices", given)
-        if given is not None and given != wanted:
-            raise ValueError(
-                f"the projector samples {given} vertices and the group convolution wants {wanted}: "
-                "give both the same mesh_level"
-            )
+        self._check_fit()
+
+    def _check_fit(self) -> None:
+        """Refuse a projector that samples another mesh than the group convolution works on."""
+        for name, what, remedy in (
+            (
+                "num_vertices",
+                "a signal of length",
+                "give both the same mesh_level, or choose a model/projector and a model/group_conv "
+                "that belong together (full_group with full_group and the same support; none with "
+                "the same reading)",
+            ),
+            ("mesh_axis", "the mesh_axis", "give both the same, with model.mesh_axis"),
+        ):
+            given = getattr(self.projector, name, None)
+            wanted = getattr(self.group_conv, name, given)
+            if given is not None and given != wanted:
+                raise ValueError(
+                    f"the projector gives {what} {given} and the group convolution wants "
+                    f"{wanted}: {remedy}"
+                )
 
     def forward(self, image: Tensor, sphere_index: Tensor | None = None) -> Tensor:
         """(B, C, S, S) and an index (B,) or None -> (B, 60, out_features)."""
@@ -143,7 +162,9 @@ class I2IPose(nn.Module):
             soft_width_rad=soft_width_rad,
             squared=squared,
         )
-        elements = icosahedron(frame=group_frame).rotations.float()
+        # The labels' group is turned with the mesh whose numbers the group convolution uses.
+        mesh_axis: MeshAxis = getattr(self.trunk.group_conv, "mesh_axis", "vertex")
+        elements = icosahedron(frame=group_frame, mesh_axis=mesh_axis).rotations.float()
         self.register_buffer("elements", elements, persistent=False)
 
     def forward(self, batch: Batch) -> PosePrediction:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, get_args
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ CHANNELS: dict[str, int] = {"gray": 1, "depth": 1, "rgb": 3}
 _RENDERERS: dict[str, tuple[str, str]] = {
     "embree": ("i2i.rendering.embree", "EmbreeRenderer"),
     "pyrender": ("i2i.rendering.pyrender", "PyrenderRenderer"),
+    "blender": ("i2i.rendering.blender", "BlenderRenderer"),
 }
 
 
@@ -32,6 +34,23 @@ class Renderer(ABC):
     """
 
     name: ClassVar[str]
+
+    @classmethod
+    def options(cls, words: Mapping[str, str]) -> dict[str, Any]:
+        """Arguments of the constructor from the options behind a renderer's name.
+
+        Args:
+            words: Each option's text by its name.
+
+        Returns:
+            All options, those left out with their defaults; most renderers have none.
+
+        Raises:
+            ValueError: for an unknown option or value.
+        """
+        if words:
+            raise ValueError(f"renderer={cls.name!r} has no options, but got {', '.join(words)}")
+        return {}
 
     @property
     @abstractmethod
@@ -131,18 +150,41 @@ def get_renderer(name: str) -> Renderer:
     """A new renderer.
 
     Args:
-        name: "embree" (ray casting, no system library) or "pyrender" (OpenGL, as in the paper).
+        name: "embree" (ray casting, no system library), "pyrender" (OpenGL, as in the paper) or
+            "blender" (path tracing), with options behind a colon: "blender:samples=16,bounces=0".
 
     Raises:
-        ValueError: for another name.
+        ValueError: for another name or option.
         RendererUnavailableError: if its library is missing.
     """
-    if name not in _RENDERERS:
-        raise ValueError(f"renderer={name!r} is unknown; use one of {', '.join(_RENDERERS)}")
-    module, class_name = _RENDERERS[name]
-    renderer_class: type[Renderer] = getattr(importlib.import_module(module), class_name)
+    renderer_class, options = _renderer_class(name)
     renderer_class.available()
-    return renderer_class()
+    return renderer_class(**options)
+
+
+def canonical_name(name: str) -> str:
+    """The name of a renderer with all of its options spelled out, as far as it has any.
+
+    Two names that mean the same renderer have the same canonical name, and it says what was drawn
+    even if a default changes. Works where the renderer is not installed.
+
+    Raises:
+        ValueError: for another name or option.
+    """
+    renderer_class, options = _renderer_class(name)
+    words = ",".join(f"{key}={value}".lower() for key, value in sorted(options.items()))
+    return f"{renderer_class.name}:{words}" if words else renderer_class.name
+
+
+def _renderer_class(name: str) -> tuple[type[Renderer], dict[str, Any]]:
+    """The class behind a name such as "blender:samples=16", and the options for its constructor."""
+    bare, _, words = name.partition(":")
+    if bare not in _RENDERERS:
+        raise ValueError(f"renderer={name!r} is unknown; use one of {', '.join(_RENDERERS)}")
+    module, class_name = _RENDERERS[bare]
+    renderer_class: type[Renderer] = getattr(importlib.import_module(module), class_name)
+    pairs = [word.partition("=") for word in words.split(",") if word]
+    return renderer_class, renderer_class.options({key.strip(): v.strip() for key, _, v in pairs})
 
 
 def renderer_names() -> tuple[str, ...]:

@@ -17,11 +17,14 @@ from torchmetrics import Metric
 
 from i2i.configuration import slug
 from i2i.data.info import DataInfo
+from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.metrics.bootstrap import Interval, instance_bootstrap, paired_median_difference
 from i2i.metrics.classification import ClassAccuracy
+from i2i.metrics.likelihood import WITHIN_DEG, calibration_error
 from i2i.metrics.retrieval import RetrievalMAP
 from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, PoseErrors
 from i2i.runs.folder import read_json, versions
+from i2i.runs.identity import changes
 
 RESULT_FORMAT = 1
 Arrays = dict[str, np.ndarray]
@@ -67,10 +70,42 @@ def _summarise_pose(arrays: Arrays, info: DataInfo, instance: Tensor) -> dict[st
         intervals[name] = _ends(instance_bootstrap(flag.double(), instance, statistic="mean"))
     for name, interval in metric.median_intervals().items():
         intervals[f"{name}/median_error_deg"] = _ends(interval)
+    metrics = _numbers(metric)
+    if "log_likelihood" in arrays:
+        scores, their_intervals = _summarise_densities(arrays, info, class_id, instance)
+        metrics, intervals = metrics | scores, intervals | their_intervals
     by_instance = [
         [round(value, 2) for value in errors[instance == i].tolist()] for i in instance.unique()
     ]
-    return {"metrics": _numbers(metric), "intervals": intervals, "errors_deg": by_instance}
+    return {"metrics": metrics, "intervals": intervals, "errors_deg": by_instance}
+
+
+def _summarise_densities(
+    arrays: Arrays, info: DataInfo, class_id: Tensor, instance: Tensor
+) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Log-likelihood, spread and calibration, and their intervals.
+
+    `likelihood_gain` is what the distribution is better than its own best guess with a width.
+    """
+    columns = {
+        name: torch.from_numpy(arrays[name]).double()
+        for name in ("log_likelihood", "point_log_likelihood", "spread_deg")
+    }
+    columns["likelihood_gain"] = columns["log_likelihood"] - columns["point_log_likelihood"]
+    intervals = {
+        name: _ends(instance_bootstrap(values, instance, statistic="mean"))
+        for name, values in columns.items()
+    }
+    angle = torch.zeros(len(instance), dtype=torch.float64)
+    for index, symmetry in enumerate(info.symmetry):
+        mine = class_id == index
+        pair = (torch.from_numpy(arrays[f"rotation_{which}"])[mine] for which in ("pred", "true"))
+        angle[mine] = symmetric_angle_rad(*(r.double() for r in pair), symmetry)
+    within = torch.from_numpy(arrays["within_30deg"])
+    right = torch.rad2deg(angle) < WITHIN_DEG
+    scores = {name: values.mean().item() for name, values in columns.items()}
+    scores["calibration_error"] = calibration_error(within, right).item()
+    return scores, intervals
 
 
 def _summarise_classes(
@@ -123,6 +158,7 @@ def result(
         "label": config.get("label"),
         "job": describe(config),
         "config_hash": identity,
+        "changes": changes(config),
         "parameters": parameters,
         "steps": steps,
         "instance_names": list(instance_names),
@@ -161,6 +197,10 @@ def describe(config: dict[str, Any]) -> dict[str, Any]:
         "labels": scale.get("labels"),
         "reg_on": scale.get("reg_on"),
         "sigma": scale.get("sigma"),
+        "shift_px": data.get("shift_px"),
+        "test_shift_px": data.get("test_shift_px"),
+        "depth_shift": data.get("depth_shift"),
+        "test_depth_shift": data.get("test_depth_shift"),
     }
 
 
@@ -190,7 +230,7 @@ def table(results: list[dict[str, Any]], *, against: str | None = None) -> str:
     head += [f"less than “{against}” by (°)"] if against else []
     lines = ["| " + " | ".join(head) + " |", "|---" + "|--:" * (len(head) - 1) + "|"]
     for (what, views, label), members in sorted(rows.items()):
-        errors, instance = _pooled(members)
+        errors, instance = pooled_errors(members)
         cells = [_cell(instance_bootstrap(errors, instance), 1)]
         for limit in ACCURACY_DEG:
             inside = (errors < limit).double()
@@ -203,7 +243,7 @@ def table(results: list[dict[str, Any]], *, against: str | None = None) -> str:
     return "\n".join(lines)
 
 
-def _pooled(members: list[dict[str, Any]]) -> tuple[Tensor, Tensor]:
+def pooled_errors(members: list[dict[str, Any]]) -> tuple[Tensor, Tensor]:
     """Errors of all seeds and the instances that they belong to."""
     pooled: dict[str, list[float]] = defaultdict(list)
     for member in sorted(members, key=lambda m: m["job"]["seed"]):
@@ -217,8 +257,8 @@ def _compared(baseline: list[dict[str, Any]], members: list[dict[str, Any]]) -> 
     seeds = {m["job"]["seed"] for m in baseline} & {m["job"]["seed"] for m in members}
     if not seeds or baseline == members:
         return ""
-    first, instance = _pooled([m for m in baseline if m["job"]["seed"] in seeds])
-    second, same = _pooled([m for m in members if m["job"]["seed"] in seeds])
+    first, instance = pooled_errors([m for m in baseline if m["job"]["seed"] in seeds])
+    second, same = pooled_errors([m for m in members if m["job"]["seed"] in seeds])
     if not torch.equal(instance, same):
         return ""
     return _cell(paired_median_difference(first, second, instance), 1)

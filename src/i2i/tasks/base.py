@@ -13,7 +13,7 @@ from i2i.data.info import DataInfo
 
 Batch = dict[str, Tensor]
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
 """Of what i2i adds to a checkpoint; raised whenever an older version could not read it."""
 
 

@@ -30,7 +30,9 @@ def error_figure(error_deg: ImageArray | Mapping[str, ImageArray], *, heading: s
     """
     named = error_deg if isinstance(error_deg, Mapping) else {"": error_deg}
     series = {name: _finite(values, name=name) for name, values in named.items()}
-    figure = new_figure(9.0, 3.4)
+    # The curves of several methods fill the axes, so their names go below.
+    below = 0.0 if len(series) == 1 else 0.2 * (len(series) + 1)
+    figure = new_figure(9.0, 3.4 + below)
     if heading:
         figure.suptitle(heading, fontsize=11, color=INK)
     histogram, recall = figure.subplots(1, 2)
@@ -78,7 +80,7 @@ def _draw_histogram(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
     axes.set(
         xlabel="rotation error (degrees)", ylabel=f"share per {_BIN_DEG:g}° (%)", xlim=(0, 180)
     )
-    _finish(axes, legend="upper right")
+    _finish(axes, legend="upper right" if single else "below")
 
 
 def _draw_recall(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
@@ -108,15 +110,18 @@ def _draw_recall(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
         ylim=(0, 101),
     )
     axes.set_xticks([0, 15, 30, 60, 90, 120, 150, 180])
-    _finish(axes, legend="lower right")
+    _finish(axes, legend="lower right" if len(series) == 1 else "below")
 
 
 def _cycle(count: int) -> list[str]:
     return [CYCLE[index % len(CYCLE)] for index in range(count)]
 
 
-def _finish(axes: Axes, *, legend: Literal["upper right", "lower right"]) -> None:
+def _finish(axes: Axes, *, legend: Literal["upper right", "lower right", "below"]) -> None:
     plain_axes(axes)
     axes.xaxis.set_tick_params(labelsize=8)
     axes.yaxis.set_tick_params(labelsize=8)
-    axes.legend(loc=legend, fontsize=8, edgecolor="none", framealpha=0.85)
+    if legend == "below":
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), fontsize=8, frameon=False)
+    else:
+        axes.legend(loc=legend, fontsize=8, edgecolor="none", framealpha=0.85)

@@ -16,10 +16,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.path import Path as MarkerPath
 
+from i2i.viz.sphere import compass, longitude_latitude
 from i2i.viz.style import HEAT, INK, VERMILION, ImageArray, new_figure, to_numpy
 
 _SECTOR_DEG = 72.0
-_POLE = 1.0 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def group_layout(rotations: ImageArray) -> GroupLayout:
         ValueError: if the rotations are not 12 directions with five turns each.
     """
     group = to_numpy(rotations).astype(np.float64)
-    axis, up = _fivefold_frame(group)
+    axis, up = fivefold_frame(group)
     pointing, upward = group @ axis, group @ up
     rounded = np.round(pointing, 6) + 0.0  # +0.0 turns −0.0 into 0.0, or unique() tells them apart
     directions, inverse = np.unique(rounded, axis=0, return_inverse=True)
@@ -66,7 +66,7 @@ def group_layout(rotations: ImageArray) -> GroupLayout:
     longitude = np.round(np.arctan2(directions[:, 1], directions[:, 0]), 5)
     order = np.lexsort((longitude, -np.round(directions[:, 2], 5)))
     row = np.argsort(order)[inverse]
-    east, north = _compass(pointing)
+    east, north = compass(pointing)
     up_deg = (
         np.degrees(np.arctan2((upward * north).sum(axis=1), (upward * east).sum(axis=1))) % 360.0
     )
@@ -119,8 +119,7 @@ def _draw_table(
     table = np.zeros((12, 5))
     table[layout.row, layout.column] = mass
     axes.imshow(table, cmap=HEAT, norm=norm, aspect="auto")
-    latitude = np.degrees(np.arcsin(np.clip(layout.directions[:, 2], -1.0, 1.0)))
-    longitude = np.degrees(np.arctan2(layout.directions[:, 1], layout.directions[:, 0]))
+    longitude, latitude = np.degrees(longitude_latitude(layout.directions))
     names = [
         f"{lat:+.0f}°" if abs(lat) > 89.0 else f"{lat:+.0f}°, {lon:+.0f}°"
         for lat, lon in zip(np.round(latitude), np.round(longitude), strict=True)
@@ -147,13 +146,11 @@ def _draw_map(
     _draw_edges(axes, layout.directions)
     color_map = ScalarMappable(norm, HEAT)
     for element, vertex in enumerate(layout.row):
-        x, y, z = layout.directions[vertex]
         middle = layout.up_deg[element]
         sector = MarkerPath.wedge(middle - _SECTOR_DEG / 2, middle + _SECTOR_DEG / 2)
         chosen = element == target
         axes.scatter(
-            np.arctan2(y, x),
-            np.arcsin(np.clip(z, -1.0, 1.0)),
+            *longitude_latitude(layout.directions[vertex]),
             s=900,
             marker=sector,
             color=color_map.to_rgba(mass[element]),
@@ -182,13 +179,13 @@ def _draw_edges(axes: Axes, directions: np.ndarray) -> None:
         arc = (1 - t) * directions[i] + t * directions[j]
         arc /= np.linalg.norm(arc, axis=1, keepdims=True)
         arc = arc[np.abs(arc[:, 2]) < 1.0 - 1e-6]  # a pole has no longitude
-        longitude, latitude = np.arctan2(arc[:, 1], arc[:, 0]), np.arcsin(arc[:, 2])
+        longitude, latitude = longitude_latitude(arc)
         breaks = np.flatnonzero(np.abs(np.diff(longitude)) > np.pi) + 1
         for part in np.split(np.arange(len(arc)), breaks):
             axes.plot(longitude[part], latitude[part], color="0.75", linewidth=0.8, zorder=1)
 
 
-def _fivefold_frame(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fivefold_frame(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The five-fold axis nearest to the camera's axis, and the camera's up axis beside it."""
     angle = np.arccos(np.clip((np.trace(group, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
     turns = group[np.isclose(angle, 2 * np.pi / 5, atol=1e-4)]
@@ -206,11 +203,3 @@ def _fivefold_frame(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     axis = axes[np.argmax(np.round(axes[:, 2], 6))]
     up = np.array([0.0, 1.0, 0.0]) - axis[1] * axis
     return axis, up / np.linalg.norm(up)
-
-
-def _compass(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """East and north at each direction, each (N, 3); at a pole as if it lay on longitude 0."""
-    x, y, z = directions.T
-    longitude = np.where(np.abs(z) > _POLE, 0.0, np.arctan2(y, x))
-    east = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=1)
-    return east, np.cross(directions, east)

@@ -15,7 +15,7 @@ from i2i.viz.classes import confusion_figure
 from i2i.viz.errors import error_figure
 from i2i.viz.grids import class_grid, prediction_grid
 from i2i.viz.rerender import rerender_each
-from i2i.viz.style import CYCLE
+from i2i.viz.style import CYCLE, to_numpy
 
 _SHOWN = 8
 
@@ -93,7 +93,7 @@ def _poses(arrays: Mapping[str, np.ndarray], info: DataInfo, datamodule: TestedD
             for key in ("rotation_pred", "rotation_true")
         ]
     return prediction_grid(
-        _images(arrays, chosen, datamodule),
+        test_images(arrays, chosen, datamodule),
         predicted=pictures[0],
         true=pictures[1],
         error_deg=arrays["error_deg"][chosen],
@@ -111,7 +111,7 @@ def _classes(
     return {
         "confusion": confusion_figure(true, predicted=predicted, class_names=info.class_names),
         "predictions": class_grid(
-            _images(arrays, chosen, datamodule),
+            test_images(arrays, chosen, datamodule),
             predicted=[info.class_names[index] for index in predicted[chosen]],
             true=[info.class_names[index] for index in true[chosen]],
             heading="test: evenly spaced images",
@@ -119,10 +119,19 @@ def _classes(
     }
 
 
-def _images(
+def test_images(
     arrays: Mapping[str, np.ndarray], chosen: np.ndarray, datamodule: TestedData
 ) -> np.ndarray:
-    """The test images of some predictions, (N, C, S, S) in [0, 1]."""
+    """The test images of some predictions as the network saw them, (N, C, S, S) in [0, 1].
+
+    Args:
+        arrays: With the ``instance_id`` and ``view_id`` of each prediction.
+        chosen: Which predictions, shape (N,).
+        datamodule: Where the images are.
+
+    Raises:
+        ValueError: if the test set lacks one of them.
+    """
     dataset = datamodule.dataset("test")
     place = {
         key: index
@@ -130,7 +139,14 @@ def _images(
             zip(dataset.instance_id.tolist(), dataset.view_id.tolist(), strict=True)
         )
     }
-    keys = zip(
-        arrays["instance_id"][chosen].tolist(), arrays["view_id"][chosen].tolist(), strict=True
+    keys = list(
+        zip(arrays["instance_id"][chosen].tolist(), arrays["view_id"][chosen].tolist(), strict=True)
     )
-    return dataset.raw_images([place[key] for key in keys]).astype(np.float32) / 255.0
+    missing = [key for key in keys if key not in place]
+    if missing:
+        raise ValueError(
+            f"The test set has no view {missing[0][1]} of object {missing[0][0]}: the data are not "
+            "those of the test; use the same data settings and root."
+        )
+    # Not the stored images: robustness runs shift theirs.
+    return to_numpy(dataset.__getitems__([place[key] for key in keys])["image"])

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 # The palette of Okabe and Ito.
@@ -22,6 +23,39 @@ HEAT = "cividis"
 """Colour map of probabilities: reads the same with every kind of colour vision."""
 
 ImageArray = np.ndarray | torch.Tensor
+
+
+def _hue_circle(count: int = 256) -> np.ndarray:
+    """Colours once round the hue circle of the Oklab space, (count, 3) in sRGB.
+
+    Equal steps look equally large, no colour is as light as paper, and lightness swings once round
+    too: blue is darkest, yellow lightest, so that turns by half a circle differ without hue.
+    """
+    hue = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + np.radians(20.0)  # starts at red
+    light = 0.66 + 0.12 * np.cos(hue - np.radians(100.0))
+    chroma = np.full(count, 0.15)
+    a, b = chroma * np.cos(hue), chroma * np.sin(hue)
+    roots = np.stack([
+        light + 0.3963377774 * a + 0.2158037573 * b,
+        light - 0.1055613458 * a - 0.0638541728 * b,
+        light - 0.0894841775 * a - 1.2914855480 * b,
+    ])  # fmt: skip
+    to_rgb = np.array([
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ])  # fmt: skip
+    linear = np.clip(to_rgb @ roots**3, 0.0, 1.0).T
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+HUES = ListedColormap(_hue_circle(), name="hues")
+"""Colour map of angles: its ends meet; 0 is red, a third green, two thirds blue."""
+
+
+def angle_color(angle_deg: np.ndarray) -> np.ndarray:
+    """Colours (N, 4) of angles (N,) in degrees."""
+    return np.asarray(HUES((np.asarray(angle_deg) % 360.0) / 360.0))
 
 
 def new_figure(width: float, height: float) -> Figure:

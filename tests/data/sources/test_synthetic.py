@@ -69,7 +69,9 @@ def test_classes_and_symmetry():
     source = SyntheticSource()
     assert source.classes == CLASSES
     assert {name for name, kind in source.symmetry.items() if kind == "z"} == {"bottle", "stool"}
-    assert set(source.symmetry.values()) == {"none", "z"}
+    assert {name for name, kind in source.symmetry.items() if kind == "z2"} == {"table"}
+    assert set(source.symmetry.values()) == {"none", "z", "z2"}
+    assert SyntheticSource(symmetry="none").symmetry["table"] == "none"
     assert (source.name, source.up_axis) == ("synthetic", "z")
     assert "MIT" in source.licence
 

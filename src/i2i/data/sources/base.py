@@ -19,7 +19,7 @@ Symmetry = Literal["none", "z"]
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 UP_AXES: tuple[str, ...] = ("x", "y", "z", "-x", "-y", "-z")
-SYMMETRIES: tuple[str, ...] = ("none", "z")
+SYMMETRIES: tuple[str, ...] = ("none", "z", "z2")
 
 # The classes whose turn about the object's z axis cannot be seen: the list of the published
 # renderer (the paper names only those of them that occur in its pose tables).
@@ -56,7 +56,7 @@ class MeshSource(ABC):
         name: Short name; it becomes a folder of the rendered store.
         up_axis: The axis of the loaded meshes that points up.
         classes: Every class that the source can offer, sorted.
-        symmetry: ``"none"`` or ``"z"`` for every class in ``classes``.
+        symmetry: ``"none"``, ``"z"`` or ``"z2"`` for every class in ``classes``.
         licence: Licence of the source as a whole.
     """
 
@@ -157,7 +157,7 @@ def resolve_symmetry(
         override: One value for all classes, or a mapping from some classes to values.
 
     Returns:
-        ``{class: "none" | "z"}`` for every class.
+        ``{class: "none" | "z" | "z2"}`` for every class.
 
     Raises:
         ValueError: A value that is not a symmetry, or a class that the source does not have.

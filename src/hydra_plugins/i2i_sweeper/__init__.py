@@ -1,0 +1,1 @@
+"""Hydra's sweeper of i2i: resumable unions of grids."""
