@@ -35,7 +35,14 @@ def test_every_option_of_a_group_composes(group):
 
 @pytest.mark.parametrize(
     ("door", "words"),
-    [("render", []), ("evaluate", []), ("predict", []), ("download", ["data=modelnet40"])],
+    [
+        ("render", []),
+        ("evaluate", []),
+        ("predict", []),
+        ("download", ["data=modelnet40"]),
+        ("check", []),
+        ("report", ["table=1"]),
+    ],
 )
 def test_every_door_composes(door, words):
     assert compose(words, door)

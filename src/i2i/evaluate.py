@@ -6,6 +6,7 @@ from typing import Any
 from lightning import Trainer
 from omegaconf import DictConfig, OmegaConf
 
+from i2i.callbacks.distributions import DistributionImages
 from i2i.callbacks.record import PredictionRecord
 from i2i.cli import door
 from i2i.configuration import register_resolvers, slug
@@ -44,7 +45,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         devices=cfg.trainer.devices,
         precision=cfg.trainer.precision or config.trainer.precision,
         logger=False,
-        callbacks=[record],
+        callbacks=[record, DistributionImages()],
         use_distributed_sampler=False,
         enable_model_summary=False,
         default_root_dir=str(output.path),

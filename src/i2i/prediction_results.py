@@ -92,7 +92,9 @@ class PoseResult:
         lines.append(f"Euler           {a:+.1f}° {b:+.1f}° {c:+.1f}°  ({EULER_CONVENTION})")
         if self.symmetry in _NOT_TOLD_APART:
             turns = _NOT_TOLD_APART[self.symmetry]
-            lines.append(f"symmetry        {turns} about the object's own z axis are not told apart")
+            lines.append(
+                f"symmetry        {turns} about the object's own z axis are not told apart"
+            )
         if self.confidence is not None:
             lines.append(f"confidence      {self.confidence:.1%}")
         lines += [

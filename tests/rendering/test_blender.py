@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -26,25 +28,35 @@ DIRECT = "blender:samples=16,bounces=0"  # what the ray caster draws: direct lig
 SIZE = 64
 
 
+_MADE: list[BlenderRenderer] = []
+
+
 def new_renderer(name: str):
+    """A renderer that really draws here, or the reason to skip; ended with its test."""
     try:
-        return get_renderer(name)
+        renderer = get_renderer(name)
+        renderer.depth(prepare_mesh(trimesh.creation.box()), np.eye(3)[None], image_size=4)
+        _MADE.append(renderer)
+        return renderer
     except RendererUnavailableError as error:
         pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
 def blender():
-    renderer = new_renderer("blender:samples=16")
-    yield renderer
-    renderer.close()
+    return new_renderer("blender:samples=16")
 
 
 @pytest.fixture(scope="module")
 def direct():
-    renderer = new_renderer(DIRECT)
-    yield renderer
-    renderer.close()
+    return new_renderer(DIRECT)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _end_them_all():
+    yield
+    for renderer in _MADE:
+        renderer.close()
 
 
 def plain_mesh(loaded: trimesh.Trimesh) -> RenderMesh:
@@ -288,16 +300,24 @@ def test_denoising_changes_the_picture_a_little(wedge, rotations):
 
 def test_order_and_other_scenes_do_not_matter(blender, wedge, rotations):
     whole = blender.render(wedge, rotations, modality="rgb", image_size=SIZE)
-    kept = blender._scene
     for index in (2, 0):
         again = blender.render(wedge, rotations[index : index + 1], modality="rgb", image_size=SIZE)
         np.testing.assert_array_equal(again[0], whole[index])
-    assert blender._scene is kept  # one set-up for all views of a mesh
-    other = BlenderRenderer(samples=4)
-    other.depth(prepare_mesh(trimesh.creation.box()), rotations[:1], image_size=32)
+    blender.depth(prepare_mesh(trimesh.creation.box()), rotations[:1], image_size=32)
     again = blender.render(wedge, rotations[:1], modality="rgb", image_size=SIZE)
     np.testing.assert_array_equal(again[0], whole[0])
-    assert blender._scene is not kept
+
+
+def test_a_mesh_is_set_up_once_for_all_views(blender, wedge, rotations, monkeypatch):
+    made = []
+    real = blender._process.set_up
+    monkeypatch.setattr(
+        blender._process, "set_up", lambda *a, **k: (made.append(a[1]), real(*a, **k))
+    )
+    for _ in range(2):
+        blender.render(wedge, rotations[:2], image_size=20)
+    blender.depth(wedge, rotations[:2], image_size=20)
+    assert made == ["gray", "depth"]
 
 
 def _draw(arguments):
@@ -322,13 +342,51 @@ def test_nothing_is_printed(blender, wedge, rotations, capfd):
     assert capfd.readouterr().out == "after\n"
 
 
-def test_temporary_files_are_removed(wedge, rotations):
+def test_nothing_is_left_behind(wedge, rotations, tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
     renderer = new_renderer("blender:samples=1")
+    process = renderer._process._process
     renderer.render(wedge, rotations[:1], image_size=32)
-    folder = renderer._scene._folder.name
-    assert os.path.isdir(folder)
+    assert len(list(tmp_path.glob("i2i-blender-*"))) == 1
+    assert "bpy" not in sys.modules  # Blender is not in this process
+    assert process.poll() is None
     renderer.close()
-    assert not os.path.exists(folder)
+    assert process.poll() == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_blender_that_died_is_told_and_started_again(wedge, rotations):
+    renderer = new_renderer("blender:samples=1")
+    first = renderer.render(wedge, rotations[:1], image_size=32)
+    renderer._process._process.kill()
+    with pytest.raises(RendererUnavailableError, match=r"process ended .*renderer=embree"):
+        renderer.render(wedge, rotations[:1], image_size=32)
+    np.testing.assert_array_equal(renderer.render(wedge, rotations[:1], image_size=32), first)
+
+
+ENDS = """
+import sys
+import numpy as np, trimesh
+from i2i.rendering import get_renderer, prepare_mesh
+kept = get_renderer("blender:samples=1")
+mesh = prepare_mesh(trimesh.creation.box())
+sys.kept = [kept, mesh, sys]  # a reference that lasts to the end
+print(kept.render(mesh, np.eye(3)[None], image_size=16).shape)
+sys.exit(3)
+"""
+
+
+def test_a_program_that_drew_ends_with_its_own_exit_code():
+    new_renderer("blender:samples=1")
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (3, "(1, 1, 16, 16)\n", "")
 
 
 # --- options and refusals -------------------------------------------------------------------------
@@ -344,13 +402,14 @@ def test_missing_package_is_refused_with_what_to_type(monkeypatch):
         get_renderer("blender")
 
 
-def test_missing_library_is_refused_with_what_to_type(monkeypatch):
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setitem(__import__("sys").modules, "bpy", None)  # importing it fails
-    with pytest.raises(
-        RendererUnavailableError, match=r"apt-get install libx11-6.*renderer=embree"
-    ):
-        get_renderer("blender")
+def test_missing_library_is_refused_with_what_to_type(monkeypatch, wedge, rotations, tmp_path):
+    broken = "raise ImportError('libXi.so.6: cannot open shared object file')"
+    (tmp_path / "bpy.py").write_text(broken)
+    monkeypatch.syspath_prepend(tmp_path)
+    renderer = BlenderRenderer()
+    with pytest.raises(RendererUnavailableError, match=r"libXi.*apt-get.*libxi6.*renderer=embree"):
+        renderer.render(wedge, rotations)
+    renderer.close()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,8 @@ class DataInfo:
     Attributes:
         class_names: Names of the classes; ``class_id`` in a batch is the index into it.
         symmetry: ``"none"``, ``"z"`` (any turn about the object's z axis) or ``"z2"`` (half turns)
-            for each class, in the same order; a property of the class, whether or not its labels were stripped.
+            for each class, in the same order; a property of the class, whether or not its labels
+            were stripped.
         channels: Image channels (1 for gray and depth, 3 for rgb).
         image_size: Height and width of the images, in pixels.
         modality: ``"gray"``, ``"depth"`` or ``"rgb"``.

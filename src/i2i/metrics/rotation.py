@@ -118,9 +118,7 @@ class PoseErrors(Metric):
         errors = torch.zeros(len(target), dtype=torch.float64, device=target.device)
         for index, symmetry in enumerate(self.symmetry):
             mine = class_id == index
-            angle = symmetric_angle_rad(
-                prediction[mine].double(), target[mine].double(), symmetry
-            )
+            angle = symmetric_angle_rad(prediction[mine].double(), target[mine].double(), symmetry)
             errors[mine] = torch.rad2deg(angle)
         return errors
 

@@ -57,6 +57,10 @@ class InPlanePose(nn.Module):
         self.in_plane = InPlaneHead(fields, num_classes=num_classes)
         self.out_of_plane = GramSchmidtHead(fields + class_size(num_classes))
 
+    def claims(self) -> list[tuple[str, str, str]]:
+        """The whole network turns with the image, for `python -m i2i.check`."""
+        return [("", "map", "rotation")]
+
     def forward(self, batch: Batch) -> PosePrediction:
         """Predict for `image` (B, C, S, S), and `class_id` (B,) where there are several classes.
 

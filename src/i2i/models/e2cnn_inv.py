@@ -43,6 +43,10 @@ class InvariantClassifier(FeatureClassifier):
         check_regular(self.encoder)
         self.order = order
 
+    def claims(self) -> list[tuple[str, str, str]]:
+        """The whole network ignores quarter turns, for `python -m i2i.check`."""
+        return [("", "map", "invariant")]
+
     def feature(self, image: Tensor) -> Tensor:
         """One invariant number for each field: (B, channels, S, S) -> (B, F)."""
         regular = self.encoder.regular_map(image)  # type: ignore[operator]

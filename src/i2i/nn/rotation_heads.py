@@ -14,14 +14,11 @@ from i2i.nn.precision import at_least_float32, full_precision
 SIGN_CLASSES = 8
 _IDENTITY_SIX = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _IDENTITY_NINE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-_WEIGHT_STD = (
-    0.01  # of a layer whose bias is the identity: small beside it, but not without gradient
-)
 _SMALLEST_NORM = 1e-8
 
 
 def _identity_biased(in_features: int, identity: tuple[float, ...]) -> nn.Linear:
-    """A linear layer that starts near a constant: no first prediction is close to a singularity."""
+    """A linear layer whose outputs start around a rotation, not around 0, where there is none."""
     linear = nn.Linear(in_features, len(identity))
     with torch.no_grad():
         linear.bias.copy_(torch.tensor(identity))

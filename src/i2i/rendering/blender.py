@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from i2i.errors import RendererUnavailableError
 from i2i.geometry.cameras import Camera
 from i2i.rendering.base import CHANNELS, Renderer
-from i2i.rendering.blender_scene import CyclesScene, load_bpy
+from i2i.rendering.blender_process import BlenderProcess
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.shading import BACKGROUND, display_value
 
@@ -28,8 +28,10 @@ class BlenderRenderer(Renderer):
     """Cycles on the processor: light that is reflected between surfaces, true area sampling.
 
     Camera, lamp, materials and normals are those of the other renderers. The same mesh, rotation
-    and options give the same bytes, whatever was drawn before and with how many threads. There is
-    one Blender in a process: two instances that take turns set up their scenes anew each time.
+    and options give the same bytes, whatever was drawn before and with how many threads.
+
+    Blender runs in a process of its own, which starts with the first picture and ends with this
+    instance. It uses OMP_NUM_THREADS threads, without that variable one for each core.
 
     Args:
         samples: Paths through each pixel. The noise falls with the square root.
@@ -42,6 +44,7 @@ class BlenderRenderer(Renderer):
     """
 
     name: ClassVar[str] = "blender"
+    _process: BlenderProcess | None = None
 
     def __init__(self, *, samples: int = 32, bounces: int = 2, denoise: bool = False) -> None:
         if samples < 1:
@@ -51,7 +54,6 @@ class BlenderRenderer(Renderer):
         self.samples, self.bounces, self.denoise = samples, bounces, denoise
         self._mesh: RenderMesh | None = None
         self._key: tuple[str, Camera, int] | None = None
-        self._scene: CyclesScene | None = None
 
     @classmethod
     def options(cls, words: Mapping[str, str]) -> dict[str, Any]:
@@ -80,7 +82,7 @@ class BlenderRenderer(Renderer):
 
     @classmethod
     def available(cls) -> None:
-        """Return if Blender's module is installed and its libraries are there.
+        """Return if Blender's module is installed; its libraries are first needed to draw.
 
         Raises:
             RendererUnavailableError: with what to install.
@@ -92,20 +94,16 @@ class BlenderRenderer(Renderer):
                 f'pip install "i2i[blender]" (it exists for Python 3.11 only; this is {python}), '
                 "or use the default: renderer=embree"
             )
-        try:
-            load_bpy()
-        except ImportError as error:
-            raise RendererUnavailableError(
-                f"the renderer 'blender' cannot load bpy ({error}); it needs these libraries "
-                "(Debian, Ubuntu): apt-get install libx11-6 libxrender1 libxfixes3 libxi6 "
-                "libxkbcommon0 libsm6 libice6 libgl1, or use the default: renderer=embree"
-            ) from error
 
     def close(self) -> None:
-        """Forget the mesh; the next call sets up a scene."""
-        if self._scene is not None:
-            self._scene.close()
-        self._mesh, self._key, self._scene = None, None, None
+        """End Blender; the next call starts it again."""
+        if self._process is not None:
+            self._process.close()
+        self._process, self._mesh, self._key = None, None, None
+
+    def __del__(self) -> None:
+        """End Blender with its last user."""
+        self.close()
 
     def _ray_lengths(
         self, mesh: RenderMesh, rotations: NDArray[np.float64], camera: Camera, image_size: int
@@ -113,9 +111,9 @@ class BlenderRenderer(Renderer):
         depth = np.zeros((len(rotations), image_size, image_size), dtype=np.float32)
         if not len(rotations):
             return depth
-        scene = self._prepare(mesh, "depth", camera, image_size)
+        process = self._prepare(mesh, "depth", camera, image_size)
         for view, rotation in enumerate(rotations):
-            picture = scene.shoot(rotation)
+            picture = process.shoot(rotation)
             depth[view] = np.where(picture[..., 3] > 0.5, picture[..., 0], 0.0)
         return depth
 
@@ -131,27 +129,30 @@ class BlenderRenderer(Renderer):
         images = np.empty((len(rotations), channels, image_size, image_size), dtype=np.uint8)
         if not len(rotations):
             return images
-        scene = self._prepare(mesh, modality, camera, image_size)
+        process = self._prepare(mesh, modality, camera, image_size)
         for view, rotation in enumerate(rotations):
-            picture = scene.shoot(rotation)
+            picture = process.shoot(rotation)
             # White under white light: the three channels of a gray picture differ by rounding only.
             images[view] = _on_white(picture).transpose(2, 0, 1)[:channels]
         return images
 
     def _prepare(
         self, mesh: RenderMesh, modality: str, camera: Camera, image_size: int
-    ) -> CyclesScene:
-        """The scene of the last call if it fits and is still there, else a new one."""
+    ) -> BlenderProcess:
+        """Blender with this mesh set up; the last set-up is kept."""
         if image_size < _SMALLEST_PICTURE:
             raise ValueError(
                 f"image_size={image_size} is too small for the renderer 'blender'; "
                 f"give at least {_SMALLEST_PICTURE}"
             )
-        key = (modality, camera, image_size)
-        fits = self._mesh is mesh and self._key == key
-        if self._scene is None or not fits or not self._scene.alive:
+        if self._process is not None and not self._process.running:
             self.close()
-            self._scene = CyclesScene(
+        if self._process is None:
+            self._process = BlenderProcess()
+        key = (modality, camera, image_size)
+        if self._mesh is not mesh or self._key != key:
+            self._mesh, self._key = None, None  # if it fails, nothing is set up
+            self._process.set_up(
                 mesh,
                 modality,
                 camera,
@@ -161,7 +162,7 @@ class BlenderRenderer(Renderer):
                 denoise=self.denoise,
             )
             self._mesh, self._key = mesh, key
-        return self._scene
+        return self._process
 
 
 def _on_white(picture: NDArray[np.float32]) -> NDArray[np.uint8]:

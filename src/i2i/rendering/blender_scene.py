@@ -1,16 +1,13 @@
 """One mesh in Blender's only scene: geometry, materials, camera, light, and pictures from Cycles.
 
 Blender as a module is one global state for a process. `CyclesScene` starts from factory settings,
-so nothing of an earlier mesh, of a user's preferences or of another scene is left.
+so nothing of an earlier mesh, of a user's preferences or of another scene is left. It belongs in a
+process of its own, see `i2i.rendering.blender_process`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +42,7 @@ _COLOR, _UV = "corner color", "corner uv"  # a plain "color" would mean the obje
 class CyclesScene:
     """A mesh that Cycles draws from any side; the set-up is shared by all pictures.
 
-    Making a second one empties Blender's state: `alive` tells whether this one is still there.
+    Making another one empties Blender's state and ends the use of this one.
 
     Args:
         mesh: In the object frame.
@@ -55,9 +52,8 @@ class CyclesScene:
         samples: Paths through each pixel; "depth" takes one, through its centre.
         bounces: Reflections from surface to surface; 0 is the light of the camera's lamp alone.
         denoise: Filter the picture with Intel's Open Image Denoise.
+        folder: Where Blender leaves its picture for Python.
     """
-
-    _last: CyclesScene | None = None
 
     def __init__(
         self,
@@ -69,16 +65,15 @@ class CyclesScene:
         samples: int,
         bounces: int,
         denoise: bool,
+        folder: Path,
     ) -> None:
-        bpy = load_bpy()
-        with quiet():
-            bpy.ops.wm.read_factory_settings(use_empty=True)
-        CyclesScene._last = self
+        import bpy
+
+        bpy.ops.wm.read_factory_settings(use_empty=True)
         self._bpy = bpy
         self._camera = camera
         self._size = image_size
-        self._folder = tempfile.TemporaryDirectory(prefix="i2i-blender-")
-        self._file = str(Path(self._folder.name) / "view.exr")
+        self._file = str(folder / "view.exr")
         self._picture: Any = None
         scene = bpy.context.scene
         _set_output(scene, image_size, self._file)
@@ -95,17 +90,6 @@ class CyclesScene:
             scene.collection.objects.link(lamp)
             lamp.parent = self._eye
 
-    @property
-    def alive(self) -> bool:
-        """Whether Blender's state is still that of this scene."""
-        return CyclesScene._last is self
-
-    def close(self) -> None:
-        """Remove the temporary folder and let go of Blender's state."""
-        self._folder.cleanup()
-        if self.alive:
-            CyclesScene._last = None
-
     def shoot(self, rotation: NDArray[np.float64]) -> NDArray[np.float32]:
         """One picture: linear light or ray lengths times the coverage, and the coverage.
 
@@ -120,8 +104,7 @@ class CyclesScene:
         pose[:3, :3] = rotation.T
         pose[:3, 3] = rotation.T @ self._camera.position
         self._eye.matrix_world = pose.T.tolist()  # Blender takes lists as columns
-        with quiet():
-            self._bpy.ops.render.render(write_still=True)
+        self._bpy.ops.render.render(write_still=True)
         if self._picture is None:
             self._picture = self._bpy.data.images.load(self._file)
         else:
@@ -129,40 +112,6 @@ class CyclesScene:
         values = np.empty(self._size * self._size * 4, dtype=np.float32)
         self._picture.pixels.foreach_get(values)
         return values.reshape(self._size, self._size, 4)[::-1]
-
-
-def load_bpy() -> Any:  # noqa: ANN401
-    """Blender's module.
-
-    Raises:
-        ImportError: if it or one of its libraries is missing.
-    """
-    before = list(sys.path)
-    with quiet():
-        import bpy
-    # Blender puts its script folders first, where another `bpy` hides the module from processes
-    # that inherit the path. Behind everything else they do no harm.
-    sys.path[:] = before + [folder for folder in sys.path if folder not in before]
-    return bpy
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Blender writes a line for each picture to the standard output, past Python: not in here."""
-    sys.stdout.flush()
-    try:
-        kept = os.dup(1)
-    except OSError:  # there is no standard output
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def _set_output(scene: Any, image_size: int, file: str) -> None:  # noqa: ANN401 - bpy has no types

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from i2i.metrics.bootstrap import (
     Interval,
+    instance_bootstrap,
     percentile_interval,
     resampled_counts,
     weighted_median,
-    instance_bootstrap,
 )
 from i2i.reports.model import Cell
 from i2i.reports.results import Result

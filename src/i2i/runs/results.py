@@ -99,8 +99,11 @@ def _summarise_densities(
     angle = torch.zeros(len(instance), dtype=torch.float64)
     for index, symmetry in enumerate(info.symmetry):
         mine = class_id == index
-        pair = (torch.from_numpy(arrays[f"rotation_{which}"])[mine] for which in ("pred", "true"))
-        angle[mine] = symmetric_angle_rad(*(r.double() for r in pair), symmetry)
+        predicted, true = (
+            torch.from_numpy(arrays[f"rotation_{which}"]).double()[mine]
+            for which in ("pred", "true")
+        )
+        angle[mine] = symmetric_angle_rad(predicted, true, symmetry)
     within = torch.from_numpy(arrays["within_30deg"])
     right = torch.rad2deg(angle) < WITHIN_DEG
     scores = {name: values.mean().item() for name, values in columns.items()}

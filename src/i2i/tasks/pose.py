@@ -49,6 +49,11 @@ class PoseTask(Task):
         assert isinstance(metric, PoseErrors)
         return metric
 
+    def _mean(self, name: str) -> MeanMetric:
+        mean = self.density[name]
+        assert isinstance(mean, MeanMetric)
+        return mean
+
     def forward(self, batch: Batch) -> PosePrediction:
         """The network's prediction, with the fitted concentration where there is one."""
         prediction: PosePrediction = self.network(batch)
@@ -61,8 +66,8 @@ class PoseTask(Task):
     ) -> dict[str, Tensor]:
         """Add the errors of a batch.
 
-        Hands on `group_correct` (B,) where there is a group and, at the test, what `_density_scores`
-        gives.
+        Hands on `group_correct` (B,) where there is a group and, at the test, what
+        `_density_scores` gives.
         """
         more: dict[str, Tensor] = {}
         group_correct = getattr(self.network, "group_correct", None)
@@ -86,7 +91,7 @@ class PoseTask(Task):
         else:
             scores = self._density_scores(prediction, batch)
             for name in _MEANS & scores.keys():
-                self.density[name].update(scores[name])
+                self._mean(name).update(scores[name])
             more |= scores
         return more
 
@@ -133,7 +138,7 @@ class PoseTask(Task):
             self.point_concentration.fill_(fitted["point"])
             values["concentration"] = self.concentration
         elif not torch.isnan(self.point_concentration):
-            values |= {name: mean.compute() for name, mean in self.density.items()}
-            for mean in self.density.values():
-                mean.reset()
+            for name in _MEANS:
+                values[name] = self._mean(name).compute()
+                self._mean(name).reset()
         return {name: value.float() for name, value in values.items()}

@@ -35,7 +35,7 @@ from functools import cache, lru_cache, singledispatch
 import torch
 from torch import Tensor, nn
 
-from i2i.geometry.icosahedron import Icosahedron, icosahedron
+from i2i.geometry.icosahedron import Icosahedron, MeshAxis, icosahedron
 from i2i.geometry.rotations import axis_rotation
 from i2i.nn.c4_resnet import C4ResNet18
 from i2i.nn.group_conv_variants import VectorFilterConv
@@ -171,7 +171,7 @@ def mesh_of(module: nn.Module) -> Icosahedron:
     if isinstance(mesh, Icosahedron):
         return mesh
     sizes = {getattr(module, "num_vertices", None), getattr(module, "sphere_size", None)}
-    mesh_axis = getattr(module, "mesh_axis", "vertex")
+    mesh_axis: MeshAxis = getattr(module, "mesh_axis", "vertex")
     for level in (1, 0, 2):
         mesh = icosahedron(level, mesh_axis=mesh_axis)
         if sizes & {len(mesh.visible), len(mesh.vertices), len(mesh.rotations)}:
