@@ -15,10 +15,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
+from i2i.configuration import compose
+from i2i.data.info import DataInfo
 from i2i.models.i2i import I2IClassifier, I2IPose
 from i2i.nn.encoders import C4ResNet18, ResNet18
 from i2i.nn.group_convs import DynamicFilterConv
 from i2i.nn.projectors import IcosahedralProjector
+from i2i.runs.building import build_network
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,18 @@ def classifier() -> I2IClassifier:
     )
 
 
+def composed(model: str, task: str = "pose", *, classes: int = 1, channels: int = 1) -> nn.Module:
+    """A network of `conf/model` at the paper's scale."""
+    info = DataInfo(
+        tuple(f"class {i}" for i in range(classes)),
+        ("none",) * classes,
+        channels=channels,
+        image_size=128,
+        modality="rgb" if channels == 3 else "gray",
+    )
+    return build_network(compose([f"model={model}", f"task={task}", "scale=paper"]), info)
+
+
 SYSTEMS = (
     System("I2I, one class", "10.9 M", 10_861_283, pose),
     System("I2I, ten classes", "10.9 M", 10_909_730, partial(pose, classes=10)),
@@ -80,7 +95,21 @@ SYSTEMS = (
         10_709_339,
         partial(pose, encoder=partial(C4ResNet18, width=31, basis="full")),
     ),
+    System("I2I without GroupConv", "", 10_864_040, partial(composed, "i2i_no_groupconv")),
+    System("I2I, full group", "", 10_863_587, partial(composed, "i2i_full_group")),
+    System("I2I, vector projection", "", 10_659_299, partial(composed, "i2i_vector")),
+    System("I2Sphere", "", 10_854_492, partial(composed, "i2sphere")),
+    System("CNN+GS", "11.2 M", 11_176_006, partial(composed, "cnn_gs")),
+    System("CNN+Proc", "11.2 M", 11_177_545, partial(composed, "cnn_procrustes")),
+    System("CNN+S3exp", "27.6 M", 27_595_332, partial(composed, "cnn_s3exp")),
+    System("CNN+S3exp, RGB", "27.6 M", 27_601_604, partial(composed, "cnn_s3exp", channels=3)),
+    System("CNN+IER", "11.4 M", 11_444_818, partial(composed, "cnn_ier")),
+    System("E2CNN-Eq", "", 10_585_058, partial(composed, "e2cnn_eq")),
     System("I2I, classification", "", 12_149_636, classifier),
+    System("CNN", "", 11_193_448, partial(composed, "cnn", "classification", classes=40)),
+    System(
+        "E2CNN-Inv", "", 10_594_820, partial(composed, "e2cnn_inv", "classification", classes=40)
+    ),
 )
 
 

@@ -160,28 +160,6 @@ def test_two_processes_train_and_test_every_image_once(door, workplace):
     assert len(arrays["error_deg"]) == len(pairs) == 12
 
 
-def test_a_sweep_runs_every_job_in_a_folder_of_its_own(door, workplace):
-    door(
-        "train",
-        "-m",
-        *TINY,
-        "seed=0,1",
-        "trainer.max_steps=5",
-        "paths.runs_dir=sweep",
-        cwd=workplace,
-    )
-    folders = sorted(p for p in (workplace / "sweep").iterdir() if p.is_dir())
-    states = [json.loads((f / "status.json").read_text()) for f in folders]
-    assert [s["state"] for s in states] == ["done", "done"]
-    assert states[0]["config_hash"] != states[1]["config_hash"]
-
-
-def test_a_sweep_over_several_processes_is_refused_with_the_reason(door, workplace):
-    done = door("train", "-m", *TINY, "seed=0,1", "trainer.devices=2", cwd=workplace, check=False)
-    assert done.returncode != 0
-    assert "trainer.devices=1" in done.stderr + done.stdout
-
-
 def test_an_encoder_from_another_package_trains_without_a_change_here(door, workplace, monkeypatch):
     package = workplace / "their_package"
     (package / "theirs" / "conf" / "model" / "encoder").mkdir(parents=True)

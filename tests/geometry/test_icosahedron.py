@@ -10,6 +10,7 @@ from i2i.geometry.icosahedron import compose, icosahedron, nearest_element, resi
 from i2i.geometry.rotations import geodesic_angle_rad, random_rotations
 
 LEVELS = (0, 1, 2)
+AXES = ("vertex", "twofold")
 PHI = (1 + math.sqrt(5)) / 2
 
 # Checkpoints depend on these orders. If this test fails, old checkpoints mean something else:
@@ -21,11 +22,19 @@ CHECKSUMS = {
     (1, "standard", False): "c98e3a69d27790b541ded746c070f7d48e0a3dd87dc01b3a4fc9312907d78cb8",
     (1, "conjugated", True): "9ba1bf3c7b7b94eef2eef1fc4811df0b527d7672bea9ac1b309e3868acec1ffd",
 }
+TWOFOLD_CHECKSUMS = {
+    (0, "conjugated", False): "ae0b416d9654cc1a5a2cf6b9afb229b693a6d226c09ce6c3af7ae0532ab7e4c4",
+    (1, "conjugated", False): "c2d53f9e1eaba8230f6cee2633ede798c85096b6892eff8b16dce3e5f6585ffd",
+    (2, "conjugated", False): "2143821ac49f48231dc697b7cf4f3a09a1d5b982639b054fd5ebe6fb2d91709a",
+    (1, "standard", False): "c2d53f9e1eaba8230f6cee2633ede798c85096b6892eff8b16dce3e5f6585ffd",
+    (1, "conjugated", True): "936e8af405b8d66725dc120e9f16a2a9215a2340fd7e4c46dfd29bd36219e3bb",
+}
 
 
-@pytest.fixture(params=LEVELS)
+@pytest.fixture(params=[(level, axis) for axis in AXES for level in LEVELS], ids=str)
 def mesh(request):
-    return icosahedron(request.param)
+    level, axis = request.param
+    return icosahedron(level, mesh_axis=axis)
 
 
 def as_set(points):
@@ -36,6 +45,13 @@ def as_set(points):
 def test_orders_are_those_of_old_checkpoints(key, expected):
     level, frame, normalize = key
     assert icosahedron(level, frame, normalize_midpoints=normalize).checksum == expected
+
+
+@pytest.mark.parametrize(("key", "expected"), TWOFOLD_CHECKSUMS.items())
+def test_orders_with_an_edge_to_the_viewer(key, expected):
+    level, frame, normalize = key
+    mesh = icosahedron(level, frame, normalize_midpoints=normalize, mesh_axis="twofold")
+    assert mesh.checksum == expected
 
 
 def test_corners_are_the_closed_form_with_a_vertex_up():
@@ -49,6 +65,19 @@ def test_corners_are_the_closed_form_with_a_vertex_up():
         expected.append((ring * math.cos(azimuth), ring * math.sin(azimuth), -1 / math.sqrt(5)))
     expected.append((0, 0, -1))
     np.testing.assert_allclose(icosahedron(0).vertices, expected, atol=1e-12)
+
+
+def test_corners_are_the_closed_form_with_an_edge_up():
+    one, phi = np.array([1, PHI]) / math.sqrt(1 + PHI**2)
+    expected = [
+        (0, one, phi), (0, -one, phi), (phi, 0, one), (-phi, 0, one),
+        (one, phi, 0), (-one, phi, 0), (-one, -phi, 0), (one, -phi, 0),
+        (phi, 0, -one), (-phi, 0, -one), (0, one, -phi), (0, -one, -phi),
+    ]  # fmt: skip
+    mesh = icosahedron(0, mesh_axis="twofold")
+    np.testing.assert_allclose(mesh.vertices, expected, atol=1e-12)
+    assert torch.equal(mesh.tilt, torch.eye(3).double())
+    assert icosahedron(1, mesh_axis="twofold").vertices[12].tolist() == pytest.approx([0, 0, phi])
 
 
 def test_tilt_leads_back_to_the_standard_corners():
@@ -70,9 +99,13 @@ def test_edges_have_the_length_of_the_literature():
     torch.testing.assert_close((a - b).norm(dim=-1), torch.full((20,), 1.05146222).double())
 
 
-@pytest.mark.parametrize(("level", "count", "half"), [(0, 12, 6), (1, 42, 16), (2, 162, 71)])
-def test_census_of_vertices_and_half_mesh(level, count, half):
-    mesh = icosahedron(level)
+@pytest.mark.parametrize(
+    ("level", "axis", "count", "half"),
+    [(0, "vertex", 12, 6), (1, "vertex", 42, 16), (2, "vertex", 162, 71),
+     (0, "twofold", 12, 4), (1, "twofold", 42, 17), (2, "twofold", 162, 73)],
+)  # fmt: skip
+def test_census_of_vertices_and_half_mesh(level, axis, count, half):
+    mesh = icosahedron(level, mesh_axis=axis)
     assert mesh.vertices.shape == (count, 3)
     assert mesh.visible.tolist() == [i for i in range(count) if mesh.vertices[i, 2] > 1e-6]
     assert len(mesh.visible) == half
@@ -129,9 +162,11 @@ def test_faces_close_the_surface_and_look_outwards(mesh):
     assert volume.item() == pytest.approx(2.536151, abs=1e-5)  # of the icosahedron of unit radius
 
 
-@pytest.mark.parametrize("frame", ["conjugated", "standard"])
-def test_group_axioms(frame):
-    mesh = icosahedron(1, frame)
+@pytest.mark.parametrize(
+    ("frame", "axis"), [("conjugated", "vertex"), ("standard", "vertex"), ("conjugated", "twofold")]
+)
+def test_group_axioms(frame, axis):
+    mesh = icosahedron(1, frame, mesh_axis=axis)
     r = mesh.rotations
     assert r.shape == (60, 3, 3)
     torch.testing.assert_close(r @ r.mT, torch.eye(3).double().expand(60, 3, 3))
@@ -230,18 +265,49 @@ def test_elements_follow_the_documented_order():
 
 def test_turns_about_the_viewing_axis_permute_the_half_mesh(mesh):
     xy = mesh.visible_xy
+    number = 5 if mesh.mesh_axis == "vertex" else 2
+    assert len(mesh.visible_permutation) == number
     for k, permutation in enumerate(mesh.visible_permutation):
-        a = math.radians(72 * k)
+        a = 2 * math.pi * k / number
         rows = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
         turn = torch.tensor(rows, dtype=torch.float64)
         torch.testing.assert_close(xy[permutation], xy @ turn.T, atol=1e-12, rtol=0)
 
 
-def test_only_turns_about_the_viewing_axis_keep_the_half_mesh():
-    mesh = icosahedron(1)
+def test_only_turns_about_the_viewing_axis_keep_the_half_mesh(mesh):
     visible = set(mesh.visible.tolist())
     keep = [g for g in range(60) if set(mesh.action[g, mesh.visible].tolist()) == visible]
-    assert keep == [0, 1, 2, 3, 4]
+    assert keep == mesh.viewing_turns.tolist()
+    assert keep == [g for g in range(60) if mesh.rotations[g, 2, 2] > 1 - 1e-9]
+    if mesh.mesh_axis == "vertex":
+        assert keep == [0, 1, 2, 3, 4]
+    else:
+        half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+        assert len(keep) == 2
+        torch.testing.assert_close(mesh.rotations[keep[1]], half_turn)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_marks_are_the_corners_of_a_football(axis):
+    mesh = icosahedron(1, mesh_axis=axis)
+    marks = mesh.marks
+    first = (2 * mesh.vertices[0] + mesh.vertices[1]) / 3
+    torch.testing.assert_close(marks, mesh.rotations @ first, atol=1e-12, rtol=0)
+    # Every edge is cut into three equal parts: the nearest other mark is that far away.
+    distance = (marks[:, None] - marks).norm(dim=-1)
+    near = distance.sort(dim=1).values
+    edge = 1.05146222 / 3
+    torch.testing.assert_close(near[:, 1:4], torch.full((60, 3), edge).double())
+    assert near[:, 4].min() > edge + 0.1
+    assert torch.equal(icosahedron(1, "standard", mesh_axis=axis).marks, marks)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_marks_of_the_first_shell_are_visible(axis):
+    mesh = icosahedron(1, mesh_axis=axis)
+    shell = mesh.marks[mesh.elements_within(72)]
+    assert shell[:, 2].min() > 0.1
+    assert shell[:, :2].norm(dim=-1).max() < 0.9
 
 
 @pytest.mark.parametrize("frame", ["conjugated", "standard"])
@@ -299,8 +365,12 @@ def test_nearest_element_statistics():
 def test_wrong_arguments_name_the_right_ones(arguments, message):
     with pytest.raises(ValueError, match=message):
         icosahedron(*arguments)
+    with pytest.raises(ValueError, match="vertex, twofold"):
+        icosahedron(mesh_axis="face")
 
 
 def test_it_is_built_once_and_says_what_it_is():
     assert icosahedron(1) is icosahedron(level=1, frame="conjugated")
     assert "V42, half mesh 16, I60 conjugated" in repr(icosahedron(1))
+    assert "half mesh 17" in repr(icosahedron(1, mesh_axis="twofold"))
+    assert "twofold axis" in repr(icosahedron(1, mesh_axis="twofold"))

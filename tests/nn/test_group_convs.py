@@ -24,15 +24,17 @@ def direct(conv, mesh, signal, index=None):
     return out
 
 
+@pytest.mark.parametrize("axis", ["vertex", "twofold"])
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("num_spheres", [1, 3])
-def test_equals_the_written_out_sum(level, num_spheres):
+def test_equals_the_written_out_sum(level, num_spheres, axis):
     torch.manual_seed(0)
-    conv = DynamicFilterConv(5, 4, num_spheres=num_spheres, mesh_level=level).double()
+    conv = DynamicFilterConv(5, 4, num_spheres=num_spheres, mesh_level=level, mesh_axis=axis)
+    conv, mesh = conv.double(), icosahedron(level, mesh_axis=axis)
     index = torch.tensor([2, 0]) if num_spheres > 1 else None
     signal = torch.randn(2, conv.num_vertices, 20, dtype=torch.float64)
     with torch.no_grad():
-        out, expected = conv(signal, index), direct(conv, icosahedron(level), signal, index)
+        out, expected = conv(signal, index), direct(conv, mesh, signal, index)
     assert out.shape == (2, 60, 4)
     torch.testing.assert_close(out, expected, atol=1e-12, rtol=1e-12)
     single = conv.float()(signal.float(), index)

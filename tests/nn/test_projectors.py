@@ -6,7 +6,15 @@ import pytest
 import torch
 
 from i2i.geometry.icosahedron import icosahedron
-from i2i.nn.projectors import IcosahedralProjector, sampling_positions, sampling_weights
+from i2i.nn.projectors import (
+    GroupElementProjector,
+    IcosahedralProjector,
+    PooledProjector,
+    full_group_projector,
+    sampling_positions,
+    sampling_weights,
+    unconstrained_projector,
+)
 from i2i.testing import gaussian_sampler
 
 
@@ -103,9 +111,90 @@ def test_in_plane_error_at_the_working_size_falls_with_sigma():
         assert expected / 2.5 < error < expected * 2.5
 
 
-def test_levels():
-    assert IcosahedralProjector(2, 3, map_size=8, mesh_level=0).num_vertices == 6
-    assert IcosahedralProjector(2, 3, map_size=8, mesh_level=1).num_vertices == 16
+@pytest.mark.parametrize(
+    ("level", "axis", "visible"),
+    [(0, "vertex", 6), (1, "vertex", 16), (0, "twofold", 4), (1, "twofold", 17)],
+)
+def test_levels(level, axis, visible):
+    projector = IcosahedralProjector(2, 3, map_size=8, mesh_level=level, mesh_axis=axis)
+    assert projector.num_vertices == visible
+
+
+@pytest.mark.parametrize("map_size", [8, 9])
+@pytest.mark.parametrize("level", [0, 1])
+def test_half_turn_of_the_map_permutes_the_samples_of_the_twofold_mesh(level, map_size):
+    """Exactly, on any map and with any sigma; with a vertex to the viewer nothing is permuted."""
+    mesh = icosahedron(level, mesh_axis="twofold")
+    maps = torch.randn(2, 5, map_size, map_size, dtype=torch.float64)
+    turned = torch.rot90(maps, 2, (-2, -1))
+    sample = sampler(map_size, 0.35, mesh_level=level, mesh_axis="twofold").sample
+    permutation = mesh.visible_permutation[1]  # vertex i goes to permutation[i]
+    torch.testing.assert_close(sample(turned)[:, permutation], sample(maps), atol=1e-6, rtol=0)
+    assert not torch.allclose(sample(turned), sample(maps), atol=0.1)
+    other = sampler(map_size, 0.35, mesh_level=level).sample
+    before, after = other(maps)[0], other(turned)[0]
+    nearest = (before[:, None] - after).norm(dim=-1).min(dim=1).values
+    assert (nearest > 0.1).sum() >= level * 10 + 5
+
+
+@pytest.mark.parametrize("axis", ["vertex", "twofold"])
+def test_elements_are_sampled_where_they_take_the_mark(axis):
+    mesh = icosahedron(mesh_axis=axis)
+    projector = GroupElementProjector(
+        1, 1, map_size=64, sigma=0.5, coverage=0.8, mesh_axis=axis
+    ).double()
+    x, y = torch.meshgrid(
+        (torch.arange(64) + 0.5 - 32) / 25.6, (32 - torch.arange(64) - 0.5) / 25.6, indexing="xy"
+    )
+    maps = torch.stack([x, y])[None].double()  # each cell shows where it is
+    mark = (2 * mesh.vertices[0] + mesh.vertices[1]) / 3
+    expected = [mesh.rotations[g] @ mark for g in mesh.elements_within(72)]
+    assert projector.num_vertices == len(expected) == 13
+    torch.testing.assert_close(
+        projector.sample(maps)[0], torch.stack(expected)[:, :2], atol=2e-3, rtol=0
+    )
+
+
+def test_pooling():
+    maps = torch.randn(3, 4, 8, 8)
+    average = PooledProjector(4, 10, map_size=8)
+    cells = PooledProjector(4, 10, map_size=8, pooling="cells")
+    cells.linear.load_state_dict(average.linear.state_dict())
+    expected = torch.relu(average.linear(maps.mean(dim=(2, 3))))[:, None]
+    torch.testing.assert_close(average(maps), expected)
+    torch.testing.assert_close(cells(maps), expected)  # at the start
+    torch.testing.assert_close(average(torch.rot90(maps, 1, (2, 3))), expected)
+    torch.nn.init.normal_(cells.weight)
+    direct = torch.einsum("bcij,cij->bc", maps, cells.weight.view(4, 8, 8))
+    torch.testing.assert_close(
+        cells(maps), torch.relu(cells.linear(direct))[:, None], atol=1e-5, rtol=1e-5
+    )
+    assert not torch.allclose(cells(torch.rot90(maps, 1, (2, 3))), cells(maps), atol=1e-2)
+
+
+def test_pooling_without_a_linear_map_is_the_average_itself():
+    maps = torch.randn(3, 4, 8, 8)
+    projector = PooledProjector(4, 4, map_size=8, linear=False)
+    assert not list(projector.parameters())
+    torch.testing.assert_close(projector(maps)[:, 0], maps.mean(dim=(2, 3)))
+    with pytest.raises(ValueError, match="reading=pooled"):
+        PooledProjector(4, 5, map_size=8, linear=False)
+
+
+def test_the_choice_of_the_variant_chooses_the_projector():
+    def kind(factory, out_channels=10, **options):
+        return type(factory(4, out_channels, map_size=8, **options))
+
+    assert kind(full_group_projector, support="identity", sigma=0.3) is PooledProjector
+    assert kind(full_group_projector, support="local13", sigma=0.3) is GroupElementProjector
+    assert kind(unconstrained_projector, sigma=0.3) is IcosahedralProjector
+    assert kind(unconstrained_projector, 4, reading="pooled", sigma=0.3) is PooledProjector
+    with pytest.raises(ValueError, match="sampled, pooled"):
+        kind(unconstrained_projector, reading="flat")
+    with pytest.raises(ValueError, match="identity, local13"):
+        kind(full_group_projector, support="all")
+    with pytest.raises(ValueError, match="average, cells"):
+        kind(full_group_projector, pooling="max")
 
 
 def test_state_dict_is_the_parameters():
@@ -127,6 +216,8 @@ def test_errors(options):
 def test_wrong_map_is_refused():
     with pytest.raises(ValueError, match="8×8"):
         IcosahedralProjector(2, 3, map_size=8)(torch.zeros(1, 2, 9, 9))
+    with pytest.raises(ValueError, match="8×8"):
+        PooledProjector(2, 3, map_size=8)(torch.zeros(1, 2, 9, 9))
 
 
 def test_weights_are_a_gaussian():
