@@ -127,9 +127,7 @@ def test_feature_side_symmetry_on_the_group(support, axis):
     def left(h, x):
         return x.index_select(-2, mesh.multiplication[h])
 
-    assert_equivariant(
-        function, sphere, input_action=left, output_action=left, elements=range(60)
-    )
+    assert_equivariant(function, sphere, input_action=left, output_action=left, elements=range(60))
     wrong = assert_equivariant(
         function,
         sphere,

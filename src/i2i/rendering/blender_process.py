@@ -96,7 +96,8 @@ class BlenderProcess:
             self._process.stdin.flush()
             error, answer = pickle.load(self._process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError) as gone:
-            code = self._process.poll()
+            self._process.kill()  # if it lives after all: what it would say next fits no question
+            code = self._process.wait()
             raise RendererUnavailableError(
                 f"Blender's process ended (exit code {code}), perhaps for lack of memory; try "
                 "fewer processes (data.render_workers=1) or another renderer: renderer=embree"
@@ -145,6 +146,7 @@ def serve(requests: IO[bytes], replies: IO[bytes], folder: Path) -> None:
 def main() -> None:
     """Serve on the standard input and output; what Blender prints goes nowhere."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the one who asks
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # remove the folder first
     replies = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
