@@ -17,6 +17,8 @@ from i2i.runs.building import build_datamodule, follow_root
 from i2i.runs.folder import RunFolder, write_json
 from i2i.runs.loading import load_task, locate
 from i2i.runs.results import summarise
+from i2i.viz.compare import compare_errors, compare_runs
+from i2i.viz.style import save_figure
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
@@ -56,7 +58,21 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     summary = summarise(record.arrays, task.info, retrieval_samples=cfg.retrieval_samples)
     write_json(output.metrics, summary)
     draw(output, record.arrays, task.info, datamodule)
+    if cfg.compare:
+        _compare(cfg, output, folder)
     return summary | {"output": str(output.path)}
+
+
+def _compare(cfg: DictConfig, output: RunFolder, folder: RunFolder) -> None:
+    """Draw this run's predictions beside those of others (the qualitative figure of the paper)."""
+    runs = [folder.path, *(locate(run)[0].path for run in cfg.compare)]
+    figures = {
+        "comparison": compare_runs(runs, data_root=cfg.data.root),
+        "comparison_errors": compare_errors(runs),
+    }
+    for name, figure in figures.items():
+        path = save_figure(figure, output.figures / f"{name}.png")
+        print(f"figure {path}")
 
 
 def _folder_name(changes: dict[str, Any]) -> str:

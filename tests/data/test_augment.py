@@ -31,10 +31,22 @@ def test_shift_matches_brute_force():
 
 @pytest.mark.parametrize(
     ("shift_px", "image_size", "expected"),
-    [(3, 128, 3), (4, 64, 2), (3, 256, 6), (3, 32, 1), (1, 16, 1), (0, 16, 0)],
+    [(3, 128, 3), (4, 64, 2), (3, 256, 6), (5, 64, 2.5), (1, 16, 0.125), (0, 16, 0)],
 )
 def test_shift_scales_with_the_image(shift_px, image_size, expected):
     assert scaled_shift(shift_px, image_size) == expected
+
+
+@pytest.mark.parametrize(("shift", "ends"), [(2.0, 2), (2.5, 3), (0.125, 1)])
+def test_shifts_are_uniform_with_a_fraction_at_the_ends(shift, ends):
+    keys = [np.arange(60_000)]
+    rows, _ = Augmentation(shift_px=shift).pixel_offsets(keys).T
+    found = {int(v): (rows == v).mean() for v in np.unique(rows)}
+    assert set(found) == set(range(-ends, ends + 1))
+    inner = 1 / (2 * shift + 1)
+    for value, frequency in found.items():
+        part = (shift - (ends - 1)) if abs(value) == ends and shift != ends else 1.0
+        assert frequency == pytest.approx(inner * part, abs=0.006)
 
 
 @pytest.mark.parametrize("shift_px", [-1, 64])

@@ -94,14 +94,20 @@ def test_samples_follow_the_components():
     assert angle.square().mean().sqrt().item() == pytest.approx(math.sqrt(3) * 2.865, rel=0.05)
 
 
-def test_spread_weighs_angles_with_masses_and_knows_symmetry():
+def test_spread_is_the_mean_angle_of_draws_and_knows_symmetry():
     truth = torch.eye(3)[None]
-    candidates = torch.stack([axis_rotation("z", a) for a in (0.0, 90.0, 180.0)])[None].float()
-    log_mass = torch.tensor([[0.5, 0.25, 0.25]]).log()
-    by_symmetry = {"none": 67.5, "z2": 22.5, "z": 0.0}
-    for symmetry, expected in by_symmetry.items():
-        found = spread_deg(log_mass, candidates, truth, symmetry).item()
+    samples = torch.stack([axis_rotation("z", a) for a in (0.0, 0.0, 90.0, 180.0)])[None]
+    for symmetry, expected in {"none": 67.5, "z2": 22.5, "z": 0.0}.items():
+        found = spread_deg(samples, truth, symmetry=symmetry).item()
         assert found == pytest.approx(expected, abs=1e-3)
+
+
+def test_spread_holds_the_width_of_the_components():
+    prediction = PosePrediction(torch.eye(3)[None], concentration=torch.tensor(400.0))
+    drawn = prediction.sample(20_000, generator(13))
+    # Three normal angles of 1/√κ rad: their norm has the mean 2√(2/π)/√κ.
+    expected = math.degrees(2 * math.sqrt(2 / math.pi) / 20)
+    assert spread_deg(drawn, torch.eye(3)[None]).item() == pytest.approx(expected, rel=0.02)
 
 
 def test_probability_within_counts_samples():

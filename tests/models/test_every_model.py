@@ -33,6 +33,8 @@ PARAMETERS = {
 }
 # Variants whose size the paper leaves open: as large as I2I.
 LIKE_I2I = {"i2i_no_groupconv": 0.02, "i2sphere": 0.03}
+# cnn_ier's corrections begin at zero, which stops the gradient of what lies below for a step.
+STEPS_TO_REACH_ALL = {"cnn_ier": 2}
 
 
 def network(model, task, *, scale, num_classes=1, modality="gray"):
@@ -77,7 +79,7 @@ def test_the_paper_scale_has_the_papers_number_of_parameters(model, task):
 
 @pytest.mark.parametrize(("model", "task"), NETWORKS)
 def test_small_keeps_the_ratio_to_i2i(model, task):
-    classes = 1 if task == "pose" else 40
+    classes = 1 if task == "pose" else 10
     ratio = {
         scale: size_of(network(model, task, scale=scale, num_classes=classes))
         / size_of(network("i2i", task, scale=scale, num_classes=classes))
@@ -96,7 +98,7 @@ def test_one_step_changes_every_parameter(model, task, num_classes):
     )  # fmt: skip
     optimizer = torch.optim.SGD(net.parameters(), lr=0.1, momentum=0.9)
     before = {name: p.detach().clone() for name, p in net.named_parameters()}
-    for _ in range(3):  # layers that begin at zero stop the gradient of those below for a step
+    for _ in range(STEPS_TO_REACH_ALL.get(model, 1)):
         optimizer.zero_grad()
         total_loss(net, given).backward()
         optimizer.step()
@@ -119,7 +121,7 @@ def test_learns_a_batch_by_heart(model, task):
         8, num_classes=classes
     )  # fmt: skip
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
-    for _ in range(150):
+    for _ in range(120):
         optimizer.zero_grad()
         total_loss(net, given).backward()
         optimizer.step()
@@ -158,3 +160,23 @@ def test_sees_colour(model, task):
     classes = 1 if task == "pose" else 4
     net = network(model, task, scale="tiny", num_classes=classes, modality="rgb")
     assert torch.isfinite(total_loss(net, batch(4, num_classes=classes, channels=3)))
+
+
+@pytest.mark.parametrize("model", [model for model, task in NETWORKS if task == "pose"])
+def test_a_turned_image_gives_another_rotation(model):
+    """With the exact stem of small, an average over the map would be blind to quarter turns."""
+    net = network(model, "pose", scale="small").train()
+    given = batch(8, size=64)
+    optimizer = torch.optim.SGD(net.parameters(), lr=1e-2)
+    for _ in range(2):  # weights for each cell begin equal
+        optimizer.zero_grad()
+        total_loss(net, given).backward()
+        optimizer.step()
+    net.eval()
+    turned = given | {"image": given["image"].rot90(1, dims=(2, 3))}
+    with torch.no_grad():
+        logits = [net(g).logits for g in (given, turned)]
+        if logits[0] is not None:
+            assert (logits[0] - logits[1]).abs().max() > 1e-5
+        else:
+            assert error_deg(net(given).rotation, net(turned).rotation).median() > 0.01

@@ -355,7 +355,8 @@ def test_nothing_is_left_behind(wedge, rotations, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_blender_that_died_is_told_and_started_again(wedge, rotations):
+def test_a_blender_that_died_is_told_and_started_again(wedge, rotations, tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # what a killed process cannot remove
     renderer = new_renderer("blender:samples=1")
     first = renderer.render(wedge, rotations[:1], image_size=32)
     renderer._process._process.kill()

@@ -41,7 +41,7 @@ def made(
         "job": {"model": model, "task": task, "data": data, "object": obj, "modality": modality,
                 "scale": scale, "seed": seed, "views_per_instance": views, "precision": "32-true",
                 "shift_px": 4, "test_shift_px": 0, "depth_shift": 0, "test_depth_shift": 0, **job},
-        "changes": changed | dict(changes),
+        "identity": identity_with(changed | dict(changes), model, task, data, scale),
         "parameters": 730951 if model == "i2i" else 700000,
         "steps": steps,
         "instance_names": names,
@@ -63,6 +63,22 @@ def made(
                               "map_retrieval_class_first": 0.72, "map_class": 0.83}  # fmt: skip
     content["config_hash"] = number or f"{hash_of(json.dumps(content, sort_keys=True)):012x}"
     return content
+
+
+def identity_with(changed, *names):
+    """The identity of a plain job of these names, with changes by dotted key."""
+    from i2i.runs.identity import _standard
+
+    identity = json.loads(json.dumps(_standard(*names) or {}))
+    for key, value in changed.items():
+        place, path = identity, key.split(".")
+        for name in path[:-1]:
+            place = place.setdefault(name, {})
+        if value is None:
+            place.pop(path[-1], None)
+        else:
+            place[path[-1]] = value
+    return identity
 
 
 def hash_of(*parts):

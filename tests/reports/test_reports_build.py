@@ -102,7 +102,7 @@ def test_settings_stand_apart_and_the_largest_comes_first(read, paper):
 
 
 def test_results_that_do_not_say_what_differs_are_left_out(read, paper):
-    report = build_report(1, read(made(), made(seed=1) | {"changes": None}), paper)
+    report = build_report(1, read(made(), made(seed=1) | {"identity": None}), paper)
     assert report.sections[0].jobs == 1
     assert any(note.startswith("Results that are left out: 1.") for note in report.notes)
 

@@ -15,7 +15,8 @@ INFO = DataInfo(("chair",), ("none",), channels=1, image_size=8, modality="gray"
 CONFIG = {
     "seed": 0,
     "label": "a label",
-    "model": {"name": "i2i", "encoder": {"stem_mode": "ref"}},
+    "model": {"name": "i2i", "encoder": {"stem_mode": "ref"},
+              "networks": {"pose": {"_target_": "x", "target": "view"}}},
     "task": {"name": "pose"},
     "data": {"name": "synthetic", "object": "chair", "modality": "gray", "image_size": 8,
              "views_per_instance": 60, "root": None, "source": {"_target_": "x", "root": "/a"}},
@@ -113,9 +114,19 @@ def test_the_identity_of_a_job_forgets_places_and_nothing_else():
         {"trainer": CONFIG["trainer"] | {"precision": "bf16-mixed"}},
         {"trainer": CONFIG["trainer"] | {"limit_test_batches": 1}},
         {"data": CONFIG["data"] | {"views_per_instance": 15}},
-        {"model": CONFIG["model"] | {"target": "rotation"}},
+        {"model": CONFIG["model"] | {"networks": {"pose": {"target": "rotation"}}}},
+        {"callbacks": {"averaging": {"_target_": "y"}}},
+        {"trainer": CONFIG["trainer"] | {"gradient_clip_algorithm": "value"}},
     ):
         assert config_hash(CONFIG | change) != here, change
+    for same in (
+        {"trainer": CONFIG["trainer"] | {"max_steps": 5.0}},
+        {"data": CONFIG["data"] | {"object": ["chair"]}},
+        {"callbacks": {"images": {"_target_": "y"}}},
+        {"data": CONFIG["data"] | {"a_new_setting": None}},
+        {"scale": {"name": "tiny", "a_new_width": 3}},
+    ):
+        assert config_hash(CONFIG | same) == here, same
     own = CONFIG | {"data": CONFIG["data"] | {"name": "meshes", "root": "/a"}}
     other = CONFIG | {"data": CONFIG["data"] | {"name": "meshes", "root": "/b"}}
     assert config_hash(own) != config_hash(other)

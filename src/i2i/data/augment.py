@@ -22,24 +22,22 @@ BACKGROUND = 255
 _ROW, _COLUMN, _DEPTH = 1, 2, 3  # one independent random stream each
 
 
-def scaled_shift(shift_px: float, image_size: int) -> int:
+def scaled_shift(shift_px: float, image_size: int) -> float:
     """Largest shift in the image's own pixels, for a setting in pixels of a 128 px image.
-
-    A setting above zero never vanishes at small sizes.
 
     Raises:
         ValueError: if the setting is negative, or as large as the image.
 
     Example:
-        >>> scaled_shift(3, 128), scaled_shift(3, 32), scaled_shift(1, 32), scaled_shift(0, 32)
-        (3, 1, 1, 0)
+        >>> scaled_shift(3, 128), scaled_shift(5, 64), scaled_shift(0, 32)
+        (3.0, 2.5, 0.0)
     """
     if not 0 <= shift_px < REFERENCE_SIZE / 2:
         raise ValueError(
             f"A pixel shift of {shift_px} is not allowed: it is in pixels of a "
             f"{REFERENCE_SIZE} px image, from 0 to {REFERENCE_SIZE // 2 - 1}."
         )
-    return max(1, round(shift_px * image_size / REFERENCE_SIZE)) if shift_px > 0 else 0
+    return shift_px * image_size / REFERENCE_SIZE
 
 
 def shift_images(images: np.ndarray, offsets: np.ndarray, *, fill: int = BACKGROUND) -> np.ndarray:
@@ -93,13 +91,13 @@ class Augmentation:
     """Shifts of a batch; the same for a sample with the same key.
 
     Attributes:
-        shift_px: Largest shift of each axis in the image's own pixels (see `scaled_shift`); shifts
-            are uniform over the whole numbers from minus to plus that (paper: ±3 at 128 px).
+        shift_px: Largest shift s of each axis in the image's own pixels (see `scaled_shift`): whole
+            numbers, uniform from −s to s (paper: ±3 at 128 px); for s = 2.5, ±3 are half as likely.
         depth_shift: Largest shift along the rays in percent of the object's diameter; depth only.
         seed: Seed of the draws.
     """
 
-    shift_px: int = 0
+    shift_px: float = 0.0
     depth_shift: float = 0.0
     seed: int = 0
 
@@ -121,7 +119,7 @@ class Augmentation:
     def pixel_offsets(self, keys: Sequence[np.ndarray]) -> np.ndarray:
         """Row and column shifts of the samples with these keys, shape (B, 2), int64."""
         draws = np.stack([self._draw(stream, keys) for stream in (_ROW, _COLUMN)], axis=1)
-        return np.floor(draws * (2 * self.shift_px + 1)).astype(np.int64) - self.shift_px
+        return np.floor(draws * (2 * self.shift_px + 1) - self.shift_px).astype(np.int64)
 
     def depth_offsets(self, keys: Sequence[np.ndarray]) -> np.ndarray:
         """Depth shifts of the samples with these keys, shape (B,), in normalised depth."""

@@ -89,21 +89,13 @@ class ConcentrationFit(Metric):
         return {"mixture": mixture, "point": point}
 
 
-def spread_deg(log_mass: Tensor, centres: Tensor, target: Tensor, symmetry: str) -> Tensor:
-    """Mean angle between what the distribution draws and the truth, in degrees: (B,).
+def spread_deg(samples: Tensor, target: Tensor, *, symmetry: str = "none") -> Tensor:
+    """Mean angle between draws (B, n, 3, 3) and the truth (B, 3, 3), in degrees: (B,).
 
-    Each candidate counts with its mass and its angle to the nearest rotation that looks like the
-    truth. The width of a mixture's components is left out.
-
-    Args:
-        log_mass: (B, K).
-        centres: (B, K, 3, 3) or (K, 3, 3).
-        target: (B, 3, 3).
-        symmetry: Of the class.
+    Each draw counts with its angle to the nearest rotation that looks like the truth.
     """
-    shared = centres if centres.ndim == 4 else centres[None]
-    angle = symmetric_angle_rad(shared.float(), target.float()[:, None], symmetry)
-    return torch.rad2deg((log_mass.double().exp() * angle.double()).sum(dim=1))
+    angle = symmetric_angle_rad(samples.float(), target.float()[:, None], symmetry)
+    return torch.rad2deg(angle.double()).mean(dim=1)
 
 
 def probability_within(

@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     from i2i.rendering.mesh import RenderMesh
 
 _PATIENCE_S = 10  # for a process that has been told to end
-_LIBRARIES = (
-    "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libxext6 libsm6 libice6 libgl1 libgomp1"
-)
+_LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libxext6 libsm6 libice6 libgl1"
 
 
 class BlenderProcess:

@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from i2i.runs.identity import changes
+
 # Not part of a setting: told apart by the table's rows and columns, or pooled.
 _NEVER_SETTINGS = ("seed", "data.object", "data.modality")
 _IN_TITLE = ("trainer.max_steps=", "trainer.precision=")  # said there already
@@ -43,11 +45,14 @@ class Result:
         """Of the weights."""
         return int(self.job["seed"])
 
-    @property
+    @cached_property
     def changes(self) -> dict[str, Any] | None:
         """What differs from the plain composition of model, task, data and scale; None: unknown."""
-        changes: dict[str, Any] | None = self.content.get("changes")
-        return changes
+        identity = self.content.get("identity")
+        if identity is None:
+            return None
+        names = {name: self.job[name] for name in ("model", "task", "data", "scale")}
+        return changes(identity, **names)
 
     @property
     def metrics(self) -> dict[str, float]:

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from hydra.errors import HydraException
@@ -13,11 +15,18 @@ from i2i.configuration import compose, plain
 _LEFT_OUT_OF_DATA = (
     "root", "store_root", "num_workers", "render_workers", "eval_batch_size", "strict",
 )  # fmt: skip
-_ROOT_IS_THE_DATASET = ("meshes", "images")
-_KEPT_OF_TRAINER = (
-    "max_steps", "max_epochs", "precision", "gradient_clip_val", "accumulate_grad_batches",
-    "devices",
+_LEFT_OUT_OF_TRAINER = (
+    "_target_", "accelerator", "strategy", "log_every_n_steps", "num_sanity_val_steps",
+    "use_distributed_sampler", "deterministic", "benchmark", "detect_anomaly", "profiler",
+    "default_root_dir", "barebones", "logger", "callbacks",
 )  # fmt: skip
+# These watch a run; any other callback may change it.
+_WATCHING = (
+    "checkpoint_last", "checkpoint_best", "record", "learning_rate", "guard", "images",
+    "distributions", "equivariance", "histogram", "hparams",
+)  # fmt: skip
+_ROOT_IS_THE_DATASET = ("meshes", "images")
+_USUAL_ROOT = {"sweethome": "/usr/share/sweethome3d/furniture"}  # another folder: other furniture
 
 
 def identity_config(config: dict[str, Any]) -> dict[str, Any]:
@@ -27,26 +36,35 @@ def identity_config(config: dict[str, Any]) -> dict[str, Any]:
     trainer. Settings without a value are not either, so that a new one changes no older identity.
     """
     task, model = config["task"], config["model"]
-    data = {k: v for k, v in config["data"].items() if k not in _LEFT_OUT_OF_DATA}
-    if data.get("name") in _ROOT_IS_THE_DATASET:
-        data["root"] = str(config["data"].get("root"))
-    if isinstance(data.get("source"), dict):
-        data["source"] = {k: v for k, v in data["source"].items() if k != "root"}
     trainer = {
         key: value
         for key, value in config["trainer"].items()
-        if key in _KEPT_OF_TRAINER or key.startswith(("limit_", "overfit_", "fast_"))
+        if key not in _LEFT_OUT_OF_TRAINER and not key.startswith("enable_")
     }
+    callbacks = {k: v for k, v in (config.get("callbacks") or {}).items() if k not in _WATCHING}
     kept = {
         "seed": config["seed"],
         "task": task,
         "model": {"name": model["name"], "network": model["networks"].get(task["name"])},
-        "data": data,
+        "data": _identity_of_data(config["data"]),
         "trainer": trainer,
+        "callbacks": callbacks or None,
         "test": config.get("test"),
     }
-    without_nulls: dict[str, Any] = _without_nulls(kept)
-    return without_nulls
+    normal: dict[str, Any] = _normal(kept)
+    return normal
+
+
+def _identity_of_data(data: dict[str, Any]) -> dict[str, Any]:
+    kept = {k: v for k, v in data.items() if k not in _LEFT_OUT_OF_DATA}
+    name, root = data.get("name"), str(data.get("root"))
+    if name in _ROOT_IS_THE_DATASET or _USUAL_ROOT.get(str(name), root) != root:
+        kept["root"] = str(Path(root).resolve())
+    if isinstance(kept.get("source"), dict):
+        kept["source"] = {k: v for k, v in kept["source"].items() if k != "root"}
+    if isinstance(kept.get("object"), list) and len(kept["object"]) == 1:
+        kept["object"] = kept["object"][0]
+    return kept
 
 
 def config_hash(config: dict[str, Any]) -> str:
@@ -55,19 +73,26 @@ def config_hash(config: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def changes(config: dict[str, Any]) -> dict[str, Any] | None:
-    """In what a job differs from the plain `model=… task=… data=… scale=…` of the same names.
+def changes(
+    identity: dict[str, Any], *, model: str, task: str, data: str, scale: str
+) -> dict[str, Any] | None:
+    """In what a job differs from the plain `model=… task=… data=… scale=…`, as it is today.
+
+    Args:
+        identity: Of `identity_config`.
+        model: Name of the job's model.
+        task: Name of its task.
+        data: Name of its source.
+        scale: Name of its scale.
 
     Returns:
         Dotted key -> value of the job, None where the plain one has it and the job does not; or
         None where there is no plain one, such as for a model file of another package.
     """
-    groups = ("model", "task", "data", "scale")
-    try:
-        standard = plain(compose([f"{group}={config[group]['name']}" for group in groups]))
-    except (HydraException, OmegaConfBaseException, KeyError):
+    standard = _standard(model, task, data, scale)
+    if standard is None:
         return None
-    ours, theirs = _flat(identity_config(config)), _flat(identity_config(standard))
+    ours, theirs = _flat(identity), _flat(standard)
     return {
         key: ours.get(key)
         for key in sorted(ours.keys() | theirs.keys())
@@ -75,10 +100,22 @@ def changes(config: dict[str, Any]) -> dict[str, Any] | None:
     }
 
 
-def _without_nulls(value: Any) -> Any:  # noqa: ANN401 - any YAML value
+@cache
+def _standard(model: str, task: str, data: str, scale: str) -> dict[str, Any] | None:
+    words = [f"model={model}", f"task={task}", f"data={data}", f"scale={scale}"]
+    try:
+        return identity_config(plain(compose(words)))
+    except (HydraException, OmegaConfBaseException, KeyError):
+        return None
+
+
+def _normal(value: Any) -> Any:  # noqa: ANN401 - any YAML value
+    """Without settings that have no value, and 5.0 as 5: how a number was typed is no matter."""
     if isinstance(value, dict):
-        return {k: _without_nulls(v) for k, v in value.items() if v is not None}
-    return value
+        return {k: _normal(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list):
+        return [_normal(v) for v in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -24,7 +24,7 @@ from i2i.metrics.likelihood import WITHIN_DEG, calibration_error
 from i2i.metrics.retrieval import RetrievalMAP
 from i2i.metrics.rotation import ACCURACY_DEG, FLIP_DEG, PoseErrors
 from i2i.runs.folder import read_json, versions
-from i2i.runs.identity import changes
+from i2i.runs.identity import identity_config
 
 RESULT_FORMAT = 1
 Arrays = dict[str, np.ndarray]
@@ -71,7 +71,7 @@ def _summarise_pose(arrays: Arrays, info: DataInfo, instance: Tensor) -> dict[st
     for name, interval in metric.median_intervals().items():
         intervals[f"{name}/median_error_deg"] = _ends(interval)
     metrics = _numbers(metric)
-    if "log_likelihood" in arrays:
+    if "log_likelihood" in arrays or "point_log_likelihood" in arrays:
         scores, their_intervals = _summarise_densities(arrays, info, class_id, instance)
         metrics, intervals = metrics | scores, intervals | their_intervals
     by_instance = [
@@ -85,17 +85,9 @@ def _summarise_densities(
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
     """Log-likelihood, spread and calibration, and their intervals.
 
-    `likelihood_gain` is what the distribution is better than its own best guess with a width.
+    With `point_` in front they are of one component at the best guess; `likelihood_gain` is what
+    the distribution is better than that.
     """
-    columns = {
-        name: torch.from_numpy(arrays[name]).double()
-        for name in ("log_likelihood", "point_log_likelihood", "spread_deg")
-    }
-    columns["likelihood_gain"] = columns["log_likelihood"] - columns["point_log_likelihood"]
-    intervals = {
-        name: _ends(instance_bootstrap(values, instance, statistic="mean"))
-        for name, values in columns.items()
-    }
     angle = torch.zeros(len(instance), dtype=torch.float64)
     for index, symmetry in enumerate(info.symmetry):
         mine = class_id == index
@@ -104,11 +96,24 @@ def _summarise_densities(
             for which in ("pred", "true")
         )
         angle[mine] = symmetric_angle_rad(predicted, true, symmetry)
-    within = torch.from_numpy(arrays["within_30deg"])
     right = torch.rad2deg(angle) < WITHIN_DEG
-    scores = {name: values.mean().item() for name, values in columns.items()}
-    scores["calibration_error"] = calibration_error(within, right).item()
-    return scores, intervals
+    columns: dict[str, Tensor] = {}
+    scores: dict[str, float] = {}
+    for prefix in ("", "point_"):
+        if f"{prefix}log_likelihood" not in arrays:
+            continue
+        for name in (f"{prefix}log_likelihood", f"{prefix}spread_deg"):
+            columns[name] = torch.from_numpy(arrays[name]).double()
+        within = torch.from_numpy(arrays[f"{prefix}within_30deg"])
+        scores[f"{prefix}calibration_error"] = calibration_error(within, right).item()
+    if {"log_likelihood", "point_log_likelihood"} <= columns.keys():
+        gain = columns["log_likelihood"] - columns["point_log_likelihood"]
+        columns["likelihood_gain"] = gain
+    intervals = {
+        name: _ends(instance_bootstrap(values, instance, statistic="mean"))
+        for name, values in columns.items()
+    }
+    return scores | {name: values.mean().item() for name, values in columns.items()}, intervals
 
 
 def _summarise_classes(
@@ -161,7 +166,7 @@ def result(
         "label": config.get("label"),
         "job": describe(config),
         "config_hash": identity,
-        "changes": changes(config),
+        "identity": identity_config(config),
         "parameters": parameters,
         "steps": steps,
         "instance_names": list(instance_names),

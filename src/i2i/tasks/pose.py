@@ -11,7 +11,7 @@ from i2i.metrics.rotation import PoseErrors
 from i2i.models.prediction import PosePrediction
 from i2i.tasks.base import Batch, Task
 
-_MEANS = {"log_likelihood", "point_log_likelihood", "spread_deg"}
+_MEANS = ("log_likelihood", "spread_deg", "point_log_likelihood", "point_spread_deg")
 _SAMPLES = 200  # of each image's distribution, for its calibration
 
 
@@ -40,7 +40,7 @@ class PoseTask(Task):
         names, symmetry = self.info.class_names, self.info.symmetry
         self.errors = nn.ModuleDict({s: PoseErrors(names, symmetry) for s in ("val", "test")})
         self.fit = ConcentrationFit()
-        self.density = nn.ModuleDict({name: MeanMetric() for name in sorted(_MEANS)})
+        self.density = nn.ModuleDict({name: MeanMetric() for name in _MEANS})
         for name in ("concentration", "point_concentration"):
             self.register_buffer(name, torch.tensor(torch.nan, dtype=torch.float64))
 
@@ -57,7 +57,7 @@ class PoseTask(Task):
     def forward(self, batch: Batch) -> PosePrediction:
         """The network's prediction, with the fitted concentration where there is one."""
         prediction: PosePrediction = self.network(batch)
-        if not torch.isnan(self.concentration):
+        if not self.training and not torch.isnan(self.concentration):
             prediction.concentration = self.concentration
         return prediction
 
@@ -90,41 +90,45 @@ class PoseTask(Task):
             )
         else:
             scores = self._density_scores(prediction, batch)
-            for name in _MEANS & scores.keys():
-                self._mean(name).update(scores[name])
+            for name in _MEANS:
+                if name in scores:
+                    self._mean(name).update(scores[name])
             more |= scores
         return more
 
     def _density_scores(self, prediction: PosePrediction, batch: Batch) -> dict[str, Tensor]:
-        """For each image (B,): log densities at the truth, spread, and the odds of being right.
+        """What the distribution of each image is worth, (B,) each.
 
-        `log_likelihood` is the network's, `point_log_likelihood` that of one component at its best
-        guess; `within_30deg` is the probability that the network gives to the truth lying within
-        30° of its guess. Empty where nothing was fitted: there was no validation.
+        `log_likelihood` is the log density at the truth, `spread_deg` the mean angle between draws
+        and the truth, `within_30deg` the probability of being within 30° of the best guess; with
+        `point_` in front, of one component at the best guess. What needs a concentration is left
+        out where there was no validation to fit it on.
         """
-        if torch.isnan(self.point_concentration):
-            return {}
-        prediction.concentration = self.concentration
-        point = PosePrediction(prediction.rotation, concentration=self.point_concentration)
-        truth = batch["rotation"][:, None]
+        scores: dict[str, Tensor] = {}
+        if prediction.equal_volume or not torch.isnan(self.concentration):
+            prediction.concentration = self.concentration
+            scores |= self._scores_of(prediction, batch)
+        if not torch.isnan(self.point_concentration):
+            point = PosePrediction(prediction.rotation, concentration=self.point_concentration)
+            scores |= {f"point_{k}": v for k, v in self._scores_of(point, batch).items()}
+        return scores
+
+    def _scores_of(self, prediction: PosePrediction, batch: Batch) -> dict[str, Tensor]:
+        truth, rotation = batch["rotation"], prediction.rotation
         # The same draws in every process and every test.
-        generator = torch.Generator(prediction.rotation.device).manual_seed(0)
+        generator = torch.Generator(rotation.device).manual_seed(0)
         samples = prediction.sample(_SAMPLES, generator)
-        scores = {
-            "log_likelihood": prediction.log_density(truth)[:, 0],
-            "point_log_likelihood": point.log_density(truth)[:, 0],
-        }
-        log_mass, centres = prediction.components()
         spread = torch.zeros(len(truth), dtype=torch.float64, device=truth.device)
         within = torch.zeros_like(spread)
         for index, symmetry in enumerate(self.info.symmetry):
             mine = batch["class_id"] == index
-            own = centres if centres.ndim == 3 else centres[mine]
-            spread[mine] = spread_deg(log_mass[mine], own, batch["rotation"][mine], symmetry)
-            within[mine] = probability_within(
-                samples[mine], prediction.rotation[mine], symmetry=symmetry
-            )
-        return scores | {"spread_deg": spread, "within_30deg": within}
+            spread[mine] = spread_deg(samples[mine], truth[mine], symmetry=symmetry)
+            within[mine] = probability_within(samples[mine], rotation[mine], symmetry=symmetry)
+        return {
+            "log_likelihood": prediction.log_density(truth[:, None])[:, 0],
+            "spread_deg": spread,
+            "within_30deg": within,
+        }
 
     def compute_metrics(self, stage: str) -> dict[str, Tensor]:
         """Scores of a stage; resets them. At a validation the concentrations are fitted anew."""
@@ -137,8 +141,9 @@ class PoseTask(Task):
             self.concentration.fill_(fitted["mixture"])
             self.point_concentration.fill_(fitted["point"])
             values["concentration"] = self.concentration
-        elif not torch.isnan(self.point_concentration):
+        else:
             for name in _MEANS:
-                values[name] = self._mean(name).compute()
-                self._mean(name).reset()
+                if self._mean(name).update_called:
+                    values[name] = self._mean(name).compute()
+                    self._mean(name).reset()
         return {name: value.float() for name, value in values.items()}

@@ -12,14 +12,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from i2i.data.info import SYMMETRIES
+
 if TYPE_CHECKING:
     import trimesh
 
-Symmetry = Literal["none", "z"]
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 UP_AXES: tuple[str, ...] = ("x", "y", "z", "-x", "-y", "-z")
-SYMMETRIES: tuple[str, ...] = ("none", "z", "z2")
 
 # The classes whose turn about the object's z axis cannot be seen: the list of the published
 # renderer (the paper names only those of them that occur in its pose tables).
