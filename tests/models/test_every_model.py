@@ -179,4 +179,4 @@ def test_a_turned_image_gives_another_rotation(model):
         if logits[0] is not None:
             assert (logits[0] - logits[1]).abs().max() > 1e-5
         else:
-            assert error_deg(net(given).rotation, net(turned).rotation).median() > 0.01
+            assert error_deg(net(given).rotation, net(turned).rotation).median() > 1e-3
