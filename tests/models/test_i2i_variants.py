@@ -16,7 +16,7 @@ VARIANTS = {
     "no_groupconv": ["model=i2i_no_groupconv"],
     "no_groupconv pooled": ["model=i2i_no_groupconv", "model.reading=pooled"],
     "sparse": ["model=i2i_sparse"],
-    "full_group": ["model=i2i_full_group"],
+    "full_group": ["model=i2i_full_group", "model.projector.pooling=average"],
     "full_group cells": ["model=i2i_full_group", "model.projector.pooling=cells"],
     "full_group local13": ["model=i2i_full_group", "model.support=local13"],
     "vector": ["model=i2i_vector"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 
@@ -388,6 +389,34 @@ def test_a_program_that_drew_ends_with_its_own_exit_code():
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert (done.returncode, done.stdout, done.stderr) == (3, "(1, 1, 16, 16)\n", "")
+
+
+DIES = """
+import os, signal
+import numpy as np, trimesh
+from i2i.rendering import get_renderer, prepare_mesh
+renderer = get_renderer("blender:samples=1")
+renderer.render(prepare_mesh(trimesh.creation.box()), np.eye(3)[None], image_size=16)
+print(renderer._process._process.pid, flush=True)
+os.killpg(0, signal.SIGTERM)
+"""
+
+
+def test_blender_ends_with_a_program_that_is_killed(tmp_path):
+    """By a signal to the whole group, as a scheduler or `timeout` sends it."""
+    new_renderer("blender:samples=1")
+    done = subprocess.run(
+        [sys.executable, "-c", DIES],
+        capture_output=True,  # returns when Blender has closed its error output, too
+        text=True,
+        timeout=120,
+        check=False,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)},
+    )
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+    assert done.stdout.strip().isdigit()
+    assert not list(tmp_path.iterdir())
 
 
 # --- options and refusals -------------------------------------------------------------------------

@@ -143,8 +143,10 @@ def serve(requests: IO[bytes], replies: IO[bytes], folder: Path) -> None:
 
 def main() -> None:
     """Serve on the standard input and output; what Blender prints goes nowhere."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the one who asks
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # remove the folder first
+    # Both reach the whole group of processes. The one who asks decides; when it ends, so does the
+    # input, and the folder below is removed. An exception in the middle of Blender would hang it.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     replies = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
