@@ -37,9 +37,14 @@ def run(installed, *words):
 
 
 def test_every_configuration_file_is_in_the_wheel(installed):
-    shipped = {p.relative_to(installed / "i2i" / "conf") for p in installed.rglob("*.yaml")}
+    shipped = {
+        p.relative_to(installed / "i2i" / "conf")
+        for p in (installed / "i2i" / "conf").rglob("*.yaml")
+    }
     tracked = {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")}
     assert {p for p in tracked if p.parts[0] != "local"} <= shipped
+    assert (installed / "i2i" / "reports" / "paper.yaml").is_file()
+    assert list((installed / "hydra_plugins" / "i2i_sweeper").glob("*.py"))
 
 
 def test_the_installed_package_composes_and_shows_its_help(installed):

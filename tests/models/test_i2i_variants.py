@@ -133,7 +133,7 @@ def test_each_class_has_weights_of_its_own(variant):
         (["model/group_conv=none", "model/projector=unconstrained", "+model.reading=pooled"],
          "no_groupconv pooled"),
         (["model/group_conv=vector"], "vector"),
-        (["model/group_conv=full_group", "model/projector=full_group"], "full_group"),
+        (["model/group_conv=full_group", "model/projector=full_group"], "full_group cells"),
         (["model/group_conv=full_group", "model/projector=full_group", "+model.support=local13"],
          "full_group local13"),
         (["model.mesh_axis=twofold"], "twofold"),

@@ -112,7 +112,7 @@ def test_basis_is_orthonormal(lmax):
     tilt = axis_rotation("z", azimuth) @ axis_rotation("y", torch.rad2deg(points[:, 2].acos()))
     basis = wigner_basis(tilt[:, None] @ axis_rotation("z", turns), lmax)
     weights = weights / (4 * torch.pi)
-    gram = torch.einsum("ptc,ptd,p->cd", basis, basis, weights) / len(turns)
+    gram = torch.einsum("ntc,ntd,n->cd", basis, basis, weights) / len(turns)
     torch.testing.assert_close(gram, torch.eye(num_wigner(lmax)).double(), atol=1e-11, rtol=0)
     mean = basis.mean(dim=1).T @ weights  # only the constant has a mean
     torch.testing.assert_close(mean, torch.eye(num_wigner(lmax))[0].double(), atol=1e-12, rtol=0)
