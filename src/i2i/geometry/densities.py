@@ -2,6 +2,7 @@
 
 import math
 
+import roma
 import torch
 from torch import Tensor
 
@@ -58,15 +59,5 @@ def isotropic_samples(
     angle = angles[above - 1] + part * (angles[above] - angles[above - 1])
     axis = torch.randn((*shape, 3), generator=generator, dtype=torch.float64, device=device)
     axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp(min=1e-12)
-    return _from_axis_angle(axis, angle)
-
-
-def _from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
-    """Rodrigues' formula: unit axes (..., 3), radians (...,) -> (..., 3, 3)."""
-    x, y, z = axis.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    skew = skew.unflatten(-1, (3, 3))
-    sine, defect = torch.sin(angle), 2 * torch.sin(angle / 2).square()
-    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
-    return identity + sine[..., None, None] * skew + defect[..., None, None] * (skew @ skew)
+    rotations: Tensor = roma.rotvec_to_rotmat(angle[..., None] * axis)
+    return rotations

@@ -12,6 +12,7 @@ from i2i.geometry.densities import (
     isotropic_log_density,
     isotropic_samples,
 )
+from i2i.geometry.rotation_grids import nearest_cell
 
 
 @dataclass
@@ -55,7 +56,7 @@ class PosePrediction:
         """
         log_mass, centres = self.components()
         if self.equal_volume:
-            cell = _nearest(rotations, centres)
+            cell = nearest_cell(rotations.flatten(0, 1), centres).view(rotations.shape[:2])
             return log_mass.double().gather(1, cell) + math.log(centres.shape[-3] / HAAR_VOLUME)
         if self.concentration is None:
             raise ValueError(
@@ -83,11 +84,6 @@ class PosePrediction:
             return drawn
         noise = isotropic_samples(float(self.concentration), drawn.shape[:2], generator)
         return noise.to(drawn) @ drawn
-
-
-def _nearest(rotations: Tensor, centres: Tensor) -> Tensor:
-    """Index of the centre (K, 3, 3) nearest to each rotation (B, N, 3, 3): (B, N)."""
-    return (rotations.flatten(2) @ centres.flatten(1).to(rotations).T).argmax(dim=2)
 
 
 @dataclass
