@@ -90,6 +90,17 @@ def test_evaluate_gives_the_same_numbers_as_the_test_after_training(door, workpl
     assert "[" in line
 
 
+def test_evaluate_draws_runs_side_by_side_and_refuses_what_is_no_run(door, workplace, trained):
+    folder, _ = trained
+    words = [f"run={folder}", "trainer.accelerator=cpu", "output=side"]
+    door("evaluate", *words, f"compare=[{folder}]", cwd=workplace)
+    for name in ("comparison", "comparison_errors"):
+        assert (workplace / "side" / "figures" / f"{name}.png").stat().st_size > 5000
+    done = door("evaluate", *words, "compare=[nowhere]", cwd=workplace, check=False)
+    assert done.returncode == 1
+    assert "run=nowhere: no such run folder" in done.stderr
+
+
 def test_predict_says_rotation_confidence_and_alternatives_and_draws(door, workplace, trained):
     folder, _ = trained
     from PIL import Image

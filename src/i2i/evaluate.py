@@ -32,6 +32,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     """
     register_resolvers()
     folder, checkpoint = locate(cfg.run, cfg.ckpt)
+    compared = [folder.path, *(locate(run)[0].path for run in cfg.compare)]
     task = load_task(checkpoint)
     changes = {key: value for key, value in cfg.data.items() if value is not None}
     config = OmegaConf.merge(task.run_config, {"data": changes})
@@ -59,15 +60,14 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     write_json(output.metrics, summary)
     draw(output, record.arrays, task.info, datamodule)
     if cfg.compare:
-        _compare(cfg, output, folder)
+        _compare(compared, output, cfg.data.root)
     return summary | {"output": str(output.path)}
 
 
-def _compare(cfg: DictConfig, output: RunFolder, folder: RunFolder) -> None:
+def _compare(runs: list[Path], output: RunFolder, data_root: str | None) -> None:
     """Draw this run's predictions beside those of others (the qualitative figure of the paper)."""
-    runs = [folder.path, *(locate(run)[0].path for run in cfg.compare)]
     figures = {
-        "comparison": compare_runs(runs, data_root=cfg.data.root),
+        "comparison": compare_runs(runs, data_root=data_root),
         "comparison_errors": compare_errors(runs),
     }
     for name, figure in figures.items():
