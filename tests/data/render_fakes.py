@@ -70,6 +70,12 @@ class FakeRenderer:
         pixels = (mixed >> np.uint64(7)) % np.uint64(251)
         return pixels.astype(np.uint8).reshape(len(rotations), channels, image_size, image_size)
 
+    def depth(self, mesh, rotations, *, camera, image_size):
+        pixels = self.render(
+            mesh, rotations, camera=camera, image_size=image_size, modality="depth"
+        )[:, 0]
+        return np.where(pixels < 120, camera.distance - 1 + pixels / 120, 0).astype(np.float32)
+
 
 def _in_worker():
     import multiprocessing

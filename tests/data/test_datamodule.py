@@ -235,7 +235,7 @@ def test_small_data_gives_a_smaller_batch_with_a_notice(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         [batch] = list(module.train_dataloader())
     assert len(batch["image"]) == 6
-    assert "only 6 training images" in caplog.text
+    assert "only 6 training samples" in caplog.text
 
 
 def test_test_shift_is_fixed_and_belongs_to_the_view(tmp_path):

@@ -81,3 +81,9 @@ def test_no_training_picture_is_reported(pictures, tmp_path):
     pictures(["test"] * 10)
     with pytest.raises(ImageError, match="no picture for training"):
         make(tmp_path)
+
+
+@pytest.mark.parametrize("modality", ["partial_points", "full_points", "views", "grey"])
+def test_pictures_are_neither_clouds_nor_view_sets(tmp_path, modality):
+    with pytest.raises(ValueError, match=rf"modality={modality} is not allowed.*gray, depth, rgb"):
+        LabelledImagesDataModule(tmp_path, modality=modality)

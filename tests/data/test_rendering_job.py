@@ -49,7 +49,7 @@ def test_contents(tmp_path):
     paths = render(tmp_path)
     assert set(paths) == {("box", "train"), ("can", "train"), ("box", "test")}
     store = RenderedStore.open(paths["can", "train"])
-    assert store.images.shape == (20, 1, 8, 8)
+    assert store.content.shape == (20, 1, 8, 8)
     assert store.instance_ids == [f"can_{i:02d}" for i in range(4)]
     row = store.rows(["can_02"], views=range(3, 4))[0]
     rotation = view_rotation(
@@ -94,7 +94,7 @@ def test_extended_by_views_is_the_same_as_rendered_at_once(tmp_path, expected):
     render(tmp_path / "now")
     assert folder_bytes(tmp_path / "now") == expected
     many = RenderedStore.open(render(tmp_path / "now")["box", "train"])
-    assert (many.images[many.views < 2] == few.images).all()
+    assert (many.content[many.views < 2] == few.content).all()
     assert (many.rotations[many.views < 2] == few.rotations).all()
 
 

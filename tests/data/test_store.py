@@ -49,11 +49,11 @@ def folder(tmp_path):
 def test_round_trip(folder):
     store = RenderedStore.open(folder, expected=SETTINGS)
     expected = list(runs(["a", "b"], 3))
-    assert (store.images == np.concatenate([run.images for run in expected])).all()
+    assert (store.content == np.concatenate([run.content for run in expected])).all()
     assert (store.rotations == np.concatenate([run.rotations for run in expected])).all()
     assert store.instances.tolist() == [0, 0, 0, 1, 1, 1]
     assert store.views.tolist() == [0, 1, 2, 0, 1, 2]
-    assert isinstance(store.images, np.memmap)
+    assert isinstance(store.content, np.memmap)
     assert store.card["counts"] == {"images": 6, "items": 2, "skipped": 0}
     store.verify()
 
@@ -167,7 +167,7 @@ def test_replacement_cut_between_renames_is_undone(folder):
 
 def test_opened_map_survives_a_replacement(folder):
     store = RenderedStore.open(folder)
-    before = np.array(store.images)
+    before = np.array(store.content)
     write_store(folder, card(["a", "b"]), runs(["a", "b"], 3, seed=1), num_rows=6)
-    assert (store.images == before).all()
-    assert (RenderedStore.open(folder).images != before).any()
+    assert (store.content == before).all()
+    assert (RenderedStore.open(folder).content != before).any()

@@ -7,20 +7,23 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 
+from i2i.data.clouds import strip_labels
+from i2i.data.content import content_of
 from i2i.data.dataset import ImageBlock
-from i2i.data.info import CHANNELS, DataInfo
+from i2i.data.info import CHANNELS, CLOUDS, DataInfo
 from i2i.data.loaders import ImageDataModule, LoaderSettings, SplitData
 from i2i.data.reference import reference_meshes
-from i2i.data.rendering_job import StorePaths, render_store, store_settings
+from i2i.data.rendering_job import StorePaths, render_store
+from i2i.data.settings import store_settings
 from i2i.data.sources.base import MeshItem, MeshSource, override_symmetry
 from i2i.data.splits import Splits, class_modes, split_items
 from i2i.data.store import RenderedStore
 from i2i.geometry.cameras import Camera
-from i2i.geometry.symmetries import strip_symmetry
+from i2i.geometry.view_sets import num_views
 from i2i.rendering.base import Renderer
 from i2i.rendering.mesh import RenderMesh
 
@@ -35,8 +38,8 @@ class RenderedDataModule(ImageDataModule):
         source: Where the meshes come from.
         object: A class, a list of classes, or ``"all"``.
         renderer: Name of a renderer, or one.
-        modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
-        image_size: Height and width in pixels.
+        modality: A key of `i2i.data.info.CHANNELS`.
+        image_size: Height and width in pixels of images and views.
         camera_distance: Distance from the camera to the object's centre, in object radii.
         camera_fov_deg: Full field of view, in degrees.
         views_per_instance: Training (and validation) views of each object.
@@ -61,6 +64,14 @@ class RenderedDataModule(ImageDataModule):
         num_workers: See `LoaderSettings`.
         batches_per_epoch: See `LoaderSettings`.
         sampler_seed: See `LoaderSettings`.
+        num_points: Points of a cloud; for clouds only.
+        camera_set: Name of a camera set of `i2i.geometry.view_sets`; for views only.
+        cloud_image_size: Height and width of the depth image behind a partial cloud.
+        rotate_points: See `LoaderSettings`, as for all that follow.
+        point_dropout: See `LoaderSettings`.
+        point_scale: See `LoaderSettings`.
+        point_shift: See `LoaderSettings`.
+        point_noise: See `LoaderSettings`.
 
     Raises:
         ValueError: if a class or another setting is not allowed.
@@ -98,6 +109,14 @@ class RenderedDataModule(ImageDataModule):
         num_workers: int = 0,
         batches_per_epoch: int | None = None,
         sampler_seed: int = 0,
+        num_points: int | None = None,
+        camera_set: str | None = None,
+        cloud_image_size: int = 128,
+        rotate_points: bool | None = None,
+        point_dropout: float = 0.0,
+        point_scale: float = 0.0,
+        point_shift: float = 0.0,
+        point_noise: float = 0.0,
     ) -> None:
         loader = LoaderSettings(
             batch_size=batch_size,
@@ -109,13 +128,17 @@ class RenderedDataModule(ImageDataModule):
             depth_shift=depth_shift,
             test_shift_px=test_shift_px,
             test_depth_shift=test_depth_shift,
+            rotate_points=rotate_points,
+            point_dropout=point_dropout,
+            point_scale=point_scale,
+            point_shift=point_shift,
+            point_noise=point_noise,
         )
         super().__init__(loader, modality=modality, image_size=image_size)
         self.source = source
         self.class_names = source.check_classes(source.classes if object == "all" else object)
         self.renderer = renderer
-        self.modality = modality
-        self.image_size = image_size
+        self.image_size = cloud_image_size if modality in CLOUDS else image_size
         self.camera = Camera(distance=camera_distance, fov_deg=camera_fov_deg)
         self.views = {
             "train": _positive("views_per_instance", views_per_instance),
@@ -134,18 +157,22 @@ class RenderedDataModule(ImageDataModule):
         self.store_root = Path(store_root)
         self.strict = strict
         self._reference_meshes: dict[str, RenderMesh | None] = {}
-        self.settings = store_settings(
-            source,
-            renderer=renderer,
-            camera=self.camera,
-            modality=modality,
-            image_size=image_size,
-            seed=seed,
-        )
+        self._making: dict[str, Any] = {
+            "renderer": renderer,
+            "camera": self.camera,
+            "modality": modality,
+            "image_size": image_size,
+            "seed": seed,
+            "num_points": num_points,
+            "camera_set": camera_set,
+            "cloud_image_size": cloud_image_size,
+        }
+        self.settings = store_settings(source, **self._making)
 
     @property
     def info(self) -> DataInfo:
         """What networks and run folders need to know; available before anything is rendered."""
+        camera_set = self.settings.camera_set
         return DataInfo(
             class_names=self.class_names,
             symmetry=self.symmetry,
@@ -156,6 +183,9 @@ class RenderedDataModule(ImageDataModule):
             camera_fov_deg=self.camera.fov_deg,
             source=self.source.name,
             symmetry_stripped=self.strip_symmetry,
+            num_points=self.settings.num_points,
+            num_views=None if camera_set is None else num_views(camera_set),
+            camera_set=camera_set,
         )
 
     @cached_property
@@ -195,15 +225,11 @@ class RenderedDataModule(ImageDataModule):
             {"train": train, "test": self.items["test"]},
             views_per_instance=self.views,
             root=self.store_root,
-            renderer=self.renderer,
-            camera=self.camera,
-            modality=self.modality,
-            image_size=self.image_size,
-            seed=self.seed,
             num_workers=self.render_workers,
             strict=self.strict,
             overwrite=overwrite,
             progress=progress,
+            **self._making,
         )
 
     def reference_mesh(self, class_name: str) -> RenderMesh | None:
@@ -267,7 +293,7 @@ class RenderedDataModule(ImageDataModule):
         data.instance_names += full_names
         data.blocks.append(
             ImageBlock(
-                images=folder / "images.npy",
+                content=folder / f"{content_of(store.card['settings']).name}.npy",
                 rows=rows,
                 rotation=self._labels(store.rotations[rows], class_id),
                 class_id=np.full(len(rows), class_id),
@@ -279,10 +305,9 @@ class RenderedDataModule(ImageDataModule):
 
     def _labels(self, rotations: np.ndarray, class_id: int) -> np.ndarray:
         """Rotation labels, shape (N, 3, 3), float32; one for all that look the same."""
-        if self.strip_symmetry and len(rotations):
-            labels = strip_symmetry(torch.from_numpy(rotations), self.symmetry[class_id])
-            rotations = labels.numpy()
-        return rotations.astype(np.float32)
+        symmetry = self.symmetry if self.strip_symmetry else ()
+        labels = strip_labels(rotations, np.full(len(rotations), class_id), symmetry)
+        return labels.astype(np.float32)
 
 
 def _positive(name: str, value: int) -> int:

@@ -1,4 +1,4 @@
-"""Batches cut from image arrays, on disk or in memory."""
+"""Batches cut from arrays of images, clouds or view sets, on disk or in memory."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from i2i.data.augment import Augmentation
+from i2i.data.clouds import CloudAugmentation
 
 Batch = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
 class ImageBlock:
-    """Labelled images of one array.
+    """Labelled rows of one array.
 
     Attributes:
-        images: Path of an ``.npy`` file that is opened as a memory map, or an array in memory;
-            shape (R, C, S, S), uint8.
+        content: Path of an ``.npy`` file that is opened as a memory map, or an array in memory:
+            images (R, C, S, S) or view sets (R, V, C, S, S), uint8, or points (R, P, 3), float32.
         rows: Rows of the array that belong to the data set, shape (N,), int64.
         rotation: Labels of these rows, object to camera, shape (N, 3, 3), float32.
         class_id: Class of each row, shape (N,), int64.
@@ -32,7 +33,7 @@ class ImageBlock:
         view_id: View of each row, shape (N,), int64.
     """
 
-    images: Path | np.ndarray
+    content: Path | np.ndarray
     rows: np.ndarray
     rotation: np.ndarray
     class_id: np.ndarray
@@ -42,29 +43,32 @@ class ImageBlock:
 
 
 class RenderedDataset(Dataset[Batch]):
-    """Images with rotation labels; a batch is cut and augmented at once.
+    """Images, clouds or view sets with rotation labels; a batch is cut and augmented at once.
 
-    Images stay on disk: memory does not grow with the data set.
+    They stay on disk: memory does not grow with the data set.
 
     Args:
-        blocks: Where the images are; the samples are numbered block after block.
-        augmentation: Shifts, or None.
+        blocks: Where the rows are; the samples are numbered block after block.
+        augmentation: Shifts, or None; for clouds, what is done to clouds.
         key: What an augmentation depends on: ``"position"`` in the order of training, or
             ``"view"``: one fixed shift for each object and view.
+        name: Name of the rows in a batch: ``"image"``, ``"points"`` or ``"views"``.
     """
 
     def __init__(
         self,
         blocks: Sequence[ImageBlock],
         *,
-        augmentation: Augmentation | None = None,
+        augmentation: Augmentation | CloudAugmentation | None = None,
         key: str = "position",
+        name: str = "image",
     ) -> None:
         if key not in ("position", "view"):
             raise ValueError(f"key={key!r} is not known. Allowed: position, view.")
         self.augmentation = augmentation or Augmentation()
         self.key = key
-        self._sources = [block.images for block in blocks]
+        self.name = name
+        self._sources = [block.content for block in blocks]
         self._opened: dict[int, np.ndarray] = {}
         sizes = [len(block.rows) for block in blocks]
         self._source = np.repeat(np.arange(len(blocks)), sizes)
@@ -92,8 +96,9 @@ class RenderedDataset(Dataset[Batch]):
                 index is the position too.
 
         Returns:
-            ``image`` (B, C, S, S) float32 in [0, 1], ``rotation`` (B, 3, 3) float32, and
-            ``class_id``, ``instance_id``, ``view_id``, each (B,) int64.
+            ``image`` (B, C, S, S) or ``views`` (B, V, C, S, S), float32 in [0, 1], or ``points``
+            (B, P, 3) float32; ``rotation`` (B, 3, 3) float32; and ``class_id``, ``instance_id``,
+            ``view_id``, each (B,) int64.
         """
         numbers = np.asarray(pairs, dtype=np.int64)
         indices, positions = (numbers, numbers) if numbers.ndim == 1 else numbers.T
@@ -101,28 +106,33 @@ class RenderedDataset(Dataset[Batch]):
             keys = [positions]
         else:
             keys = [self._instance_key[indices], self.view_id[indices]]
-        images = self.augmentation(self._gather(indices), keys)
+        content, rotation = self._gather(indices), self.rotation[indices]
+        class_id = self.class_id[indices]
+        if isinstance(self.augmentation, CloudAugmentation):
+            content, rotation = self.augmentation(content, rotation, class_id, keys)
+        else:
+            content = self.augmentation(content, keys)
         arrays = {
-            "image": images,
-            "rotation": self.rotation[indices],
-            "class_id": self.class_id[indices],
+            self.name: content,
+            "rotation": rotation,
+            "class_id": class_id,
             "instance_id": self.instance_id[indices],
             "view_id": self.view_id[indices],
         }
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
     def raw_images(self, indices: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Stored images without augmentation, shape (B, C, S, S), uint8."""
+        """Stored rows without augmentation, for images of shape (B, C, S, S), uint8."""
         return self._gather(np.asarray(indices, dtype=np.int64))
 
     def _gather(self, indices: np.ndarray) -> np.ndarray:
-        """Images of the samples, shape (B, C, S, S), uint8."""
+        """Stored rows of the samples, shape (B, ...)."""
         sources, rows = self._source[indices], self._rows[indices]
         used = np.unique(sources)
         if len(used) == 1:
             return self._open(int(used[0]))[rows]
         first = self._open(int(used[0]))
-        result = np.empty((len(indices), *first.shape[1:]), np.uint8)
+        result = np.empty((len(indices), *first.shape[1:]), first.dtype)
         for source in used:
             here = sources == source
             result[here] = self._open(int(source))[rows[here]]

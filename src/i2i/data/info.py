@@ -6,8 +6,17 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-CHANNELS = {"gray": 1, "depth": 1, "rgb": 3}
-"""Image channels of each modality."""
+IMAGES = ("gray", "depth", "rgb")
+"""Modalities of one image, in a batch as ``image`` (B, C, S, S)."""
+
+CLOUDS = ("partial_points", "full_points")
+"""Modalities of a point cloud, in a batch as ``points`` (B, P, 3)."""
+
+VIEWS = "views"
+"""The modality of several gray views of one object, in a batch as ``views`` (B, V, C, S, S)."""
+
+CHANNELS = {"gray": 1, "depth": 1, "rgb": 3, "partial_points": 3, "full_points": 3, VIEWS: 1}
+"""Image channels, or coordinates of a point, of each modality."""
 
 SYMMETRIES = ("none", "z", "z2")
 """Symmetries that a class can have: none, any turn about its z axis, or the half turn about it."""
@@ -22,14 +31,17 @@ class DataInfo:
         symmetry: ``"none"``, ``"z"`` (any turn about the object's z axis) or ``"z2"`` (half turns)
             for each class, in the same order; a property of the class, whether or not its labels
             were stripped.
-        channels: Image channels (1 for gray and depth, 3 for rgb).
-        image_size: Height and width of the images, in pixels.
-        modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
+        channels: Image channels (1 for gray and depth, 3 for rgb); 3 for the coordinates of points.
+        image_size: Height and width of the images, in pixels; of the depth images behind clouds.
+        modality: A key of `CHANNELS`.
         background: Value of a background pixel, in [0, 1].
         camera_distance: Distance from the camera to the object's centre, in object radii.
         camera_fov_deg: Full field of view in both directions, in degrees.
         source: Name of the mesh source.
         symmetry_stripped: Whether rotations that look the same have one label.
+        num_points: Points of a cloud; None where there are none.
+        num_views: Views of an object in one sample; None where it has one image.
+        camera_set: Name of their cameras.
 
     Example:
         >>> info = DataInfo(("desk",), ("none",), channels=1, image_size=64, modality="gray")
@@ -49,6 +61,9 @@ class DataInfo:
     camera_fov_deg: float = 45.0
     source: str = ""
     symmetry_stripped: bool = True
+    num_points: int | None = None
+    num_views: int | None = None
+    camera_set: str | None = None
 
     def __post_init__(self) -> None:
         if not self.class_names:
@@ -66,6 +81,17 @@ class DataInfo:
     def num_classes(self) -> int:
         """Number of classes."""
         return len(self.class_names)
+
+    def network_arguments(self) -> dict[str, int | None]:
+        """What the constructor of a network for these data is told, by the name of its argument."""
+        if self.modality in CLOUDS:
+            return {"num_points": self.num_points, "num_classes": self.num_classes}
+        told: dict[str, int | None] = {
+            "channels": self.channels,
+            "num_classes": self.num_classes,
+            "image_size": self.image_size,
+        }
+        return {**told, "num_views": self.num_views} if self.modality == VIEWS else told
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, strings and numbers only: safe in a checkpoint and in JSON."""

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from i2i.data.clouds import strip_labels
 from i2i.data.dataset import ImageBlock
 from i2i.data.images import LabelledImages, read_labelled_images
-from i2i.data.info import CHANNELS, DataInfo
+from i2i.data.info import CHANNELS, IMAGES, DataInfo
 from i2i.data.loaders import ImageDataModule, LoaderSettings, SplitData
 from i2i.errors import ImageError
-from i2i.geometry.symmetries import strip_symmetry
 
 SPLITS = ("train", "val", "test")
 
@@ -67,11 +66,13 @@ class LabelledImagesDataModule(ImageDataModule):
         seed: int = 0,
         **loader: Any,  # noqa: ANN401 - the fields of LoaderSettings, which checks them
     ) -> None:
-        super().__init__(LoaderSettings(**loader), modality=modality, image_size=image_size)
-        if modality not in CHANNELS:
+        if modality not in IMAGES:
             raise ValueError(
-                f"data.modality={modality} is not known. Allowed: {', '.join(CHANNELS)}."
+                f"data.modality={modality} is not allowed: labelled pictures are "
+                f"{', '.join(IMAGES)}. Clouds and views are made from meshes, for example with "
+                "data=meshes."
             )
+        super().__init__(LoaderSettings(**loader), modality=modality, image_size=image_size)
         for name, value in (("val_fraction", val_fraction), ("test_fraction", test_fraction)):
             if not 0 <= value < 1:
                 raise ValueError(f"data.{name}={value} is not allowed: it must be in [0, 1).")
@@ -79,7 +80,6 @@ class LabelledImagesDataModule(ImageDataModule):
         inside = self.root.expanduser() / csv
         self.csv = inside if inside.exists() else Path(csv).expanduser()
         self.classes = None if object == "all" else _as_list(object)
-        self.modality = modality
         self.image_size = image_size
         self.quaternion_order = quaternion_order
         self.camera_distance = camera_distance
@@ -145,7 +145,7 @@ class LabelledImagesDataModule(ImageDataModule):
             for row in rows
         ]
         block = ImageBlock(
-            images=content.images,
+            content=content.images,
             rows=rows,
             rotation=labels[rows],
             class_id=content.class_ids[rows].astype(np.int64),
@@ -157,11 +157,8 @@ class LabelledImagesDataModule(ImageDataModule):
 
     def _labels(self, content: LabelledImages) -> np.ndarray:
         """Rotation labels, shape (N, 3, 3), float32."""
-        labels = np.array(content.rotations, np.float64)
-        for class_id, symmetry in enumerate(self.info.symmetry if self.strip_symmetry else ()):
-            mine = content.class_ids == class_id
-            labels[mine] = strip_symmetry(torch.from_numpy(labels[mine]), symmetry).numpy()
-        return labels.astype(np.float32)
+        symmetry = self.info.symmetry if self.strip_symmetry else ()
+        return strip_labels(content.rotations, content.class_ids, symmetry).astype(np.float32)
 
     def _parts(self, files: Sequence[str]) -> np.ndarray:
         """``"train"``, ``"val"`` or ``"test"`` for each picture."""

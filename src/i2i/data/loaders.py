@@ -11,8 +11,9 @@ from lightning import LightningDataModule
 from torch.utils.data import BatchSampler, DataLoader
 
 from i2i.data.augment import Augmentation, scaled_shift
+from i2i.data.clouds import CloudAugmentation
 from i2i.data.dataset import Batch, ImageBlock, RenderedDataset, collate
-from i2i.data.info import DataInfo
+from i2i.data.info import CLOUDS, IMAGES, VIEWS, DataInfo
 from i2i.data.sampler import EpochSampler, SliceSampler
 from i2i.rendering.mesh import RenderMesh
 
@@ -24,15 +25,22 @@ class LoaderSettings:
     """How batches are made.
 
     Attributes:
-        batch_size: Training images in a batch of all processes together.
-        eval_batch_size: Images in a validation or test batch; None for ``batch_size``.
+        batch_size: Training samples in a batch of all processes together.
+        eval_batch_size: Samples in a validation or test batch; None for ``batch_size``.
         num_workers: Loader processes; 0 loads in the training process.
         batches_per_epoch: Batches in an epoch; None for one pass over the data.
         sampler_seed: Seed of the order and of the augmentation.
-        shift_px: Largest training shift in pixels of a 128 px image (paper: 3).
+        shift_px: Largest training shift in pixels of a 128 px image (paper: 3); clouds and views
+            are not shifted.
         depth_shift: Largest training shift of depth images in percent of the object's diameter.
         test_shift_px: The same for test images, one fixed shift for each.
         test_depth_shift: The same for test images, one fixed shift for each.
+        rotate_points: Turn each training cloud by a fresh random rotation, and its label with it;
+            None for full clouds only.
+        point_dropout: Training clouds: largest share of dropped points.
+        point_scale: Training clouds: largest change of the size, one factor for all axes.
+        point_shift: Training clouds: largest shift along each axis, in radii of the cloud.
+        point_noise: Training clouds: standard deviation of each coordinate, in radii of the cloud.
     """
 
     batch_size: int = 64
@@ -44,6 +52,11 @@ class LoaderSettings:
     depth_shift: float = 0.0
     test_shift_px: float = 0
     test_depth_shift: float = 0.0
+    rotate_points: bool | None = None
+    point_dropout: float = 0.0
+    point_scale: float = 0.0
+    point_shift: float = 0.0
+    point_noise: float = 0.0
 
     def check(self, modality: str) -> None:
         """Check the settings that do not depend on the data.
@@ -64,14 +77,35 @@ class LoaderSettings:
                     f"data.{name}={value} needs data.modality=depth, but it is {modality}: leave "
                     "the depth shift out."
                 )
+        if self.test_shift_px and modality not in IMAGES:
+            raise ValueError(
+                f"data.test_shift_px={self.test_shift_px} needs one of data.modality="
+                f"{', '.join(IMAGES)}, but it is {modality}: leave the pixel shift out."
+            )
+        self._check_points(modality)
+
+    def _check_points(self, modality: str) -> None:
+        """Check the settings of clouds."""
+        below_one = ("point_dropout", "point_scale")
+        for name in ("rotate_points", *below_one, "point_shift", "point_noise"):
+            value = getattr(self, name)
+            if value and modality not in CLOUDS:
+                raise ValueError(
+                    f"data.{name}={value} needs data.modality={' or '.join(CLOUDS)}, but it is "
+                    f"{modality}: leave it out."
+                )
+            if name in below_one and not 0 <= value < 1:
+                raise ValueError(f"data.{name}={value} is not allowed: it must be in [0, 1).")
+            if name in ("point_shift", "point_noise") and not value >= 0:
+                raise ValueError(f"data.{name}={value} is not allowed: it must be 0 or more.")
 
 
 @dataclass
 class SplitData:
-    """Images and object names of one split.
+    """Rows and object names of one split.
 
     Attributes:
-        blocks: Where the images are.
+        blocks: Where the images, clouds or view sets are.
         instance_names: ``<class>/<object>`` for each ``instance_id``.
     """
 
@@ -80,14 +114,14 @@ class SplitData:
 
 
 class ImageDataModule(LightningDataModule):
-    """Data loaders over labelled images; subclasses say where the images come from.
+    """Data loaders over labelled images, clouds or view sets; subclasses say where they come from.
 
     The loaders divide batches among processes themselves, so run the trainer with
     ``use_distributed_sampler=False``.
 
     Args:
         loader: How batches are made.
-        modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
+        modality: A key of `i2i.data.info.CHANNELS`.
         image_size: Height and width in pixels.
     """
 
@@ -95,6 +129,7 @@ class ImageDataModule(LightningDataModule):
         super().__init__()
         loader.check(modality)
         self.loader = loader
+        self.modality = modality
         # Out-of-range shifts should be refused before anything is rendered.
         self._train_shift = scaled_shift(loader.shift_px, image_size)
         self._test_shift = scaled_shift(loader.test_shift_px, image_size)
@@ -111,7 +146,7 @@ class ImageDataModule(LightningDataModule):
         return None
 
     def load_splits(self) -> dict[str, SplitData]:
-        """Images of ``"train"``, ``"val"`` and ``"test"``; called once."""
+        """Rows of ``"train"``, ``"val"`` and ``"test"``; called once."""
         raise NotImplementedError
 
     def setup(self, stage: str | None = None) -> None:
@@ -119,20 +154,45 @@ class ImageDataModule(LightningDataModule):
         if self._datasets:
             return
         self._splits = self.load_splits()
-        seed = self.loader.sampler_seed
-        augmentations = {
-            "train": Augmentation(self._train_shift, self.loader.depth_shift, seed),
-            "val": Augmentation(),
-            # The seed is fixed: the shifted test set is the same one for every run.
-            "test": Augmentation(self._test_shift, self.loader.test_depth_shift, 0),
-        }
+        augmentations = self._augmentations()
         self._datasets = {
             name: RenderedDataset(
                 split.blocks,
                 augmentation=augmentations[name],
                 key="position" if name == "train" else "view",
+                name=self._batch_name(),
             )
             for name, split in self._splits.items()
+        }
+
+    def _batch_name(self) -> str:
+        """Name of the rows in a batch."""
+        if self.modality in CLOUDS:
+            return "points"
+        return "views" if self.modality == VIEWS else "image"
+
+    def _augmentations(self) -> dict[str, Augmentation | CloudAugmentation]:
+        """What is done to the samples of each split."""
+        loader, seed = self.loader, self.loader.sampler_seed
+        if self.modality in CLOUDS:
+            turned = loader.rotate_points
+            train = CloudAugmentation(
+                rotate=self.modality == "full_points" if turned is None else turned,
+                dropout=loader.point_dropout,
+                scale=loader.point_scale,
+                shift=loader.point_shift,
+                noise=loader.point_noise,
+                seed=seed,
+                symmetry=self.info.symmetry if self.info.symmetry_stripped else (),
+            )
+            return {"train": train, "val": CloudAugmentation(), "test": CloudAugmentation()}
+        if self.modality == VIEWS:
+            return {split: Augmentation() for split in ("train", "val", "test")}
+        return {
+            "train": Augmentation(self._train_shift, loader.depth_shift, seed),
+            "val": Augmentation(),
+            # The seed is fixed: the shifted test set is the same one for every run.
+            "test": Augmentation(self._test_shift, loader.test_depth_shift, 0),
         }
 
     def dataset(self, split: str) -> RenderedDataset:
@@ -164,11 +224,12 @@ class ImageDataModule(LightningDataModule):
             batch_size = num_samples // world_size * world_size
             if batch_size == 0:
                 raise ValueError(
-                    f"There are {num_samples} training images for {world_size} process(es): render "
-                    "more views (data.views_per_instance) or use fewer devices."
+                    f"There are {num_samples} training samples for {world_size} process(es): "
+                    "render more views (data.views_per_instance) or use fewer devices."
                 )
             log.warning(
-                "There are only %d training images: batches have %d instead of data.batch_size=%d.",
+                "There are only %d training samples: "
+                "batches have %d instead of data.batch_size=%d.",
                 num_samples,
                 batch_size,
                 self.loader.batch_size,

@@ -18,12 +18,13 @@ import types
 import zipfile
 from collections.abc import Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from i2i.data.rows import surface_clouds, surface_seed, view_sets, visible_clouds
 from i2i.data.sources.base import MeshItem, MeshSource
 from i2i.data.store import StoreSettings
 from i2i.errors import MeshError
@@ -61,9 +62,9 @@ class Chunk:
 
 @dataclass(frozen=True)
 class ChunkData:
-    """Contents of a chunk file: images (N, C, H, W), rotations (N, 3, 3), mesh transform (4, 4)."""
+    """Contents of a chunk file: main array (N, ...), rotations (N, 3, 3), mesh transform (4, 4)."""
 
-    images: np.ndarray
+    content: np.ndarray
     rotations: np.ndarray
     object_from_mesh: np.ndarray
 
@@ -76,11 +77,13 @@ class RenderContext:
         source: Where meshes come from.
         renderer: A renderer or its name; a name is looked up in the process that renders.
         settings: Camera, image and seed.
+        cameras: Of view sets: common frame to the axes of each camera, shape (V, 3, 3).
     """
 
     source: MeshSource
     renderer: Renderer | str
     settings: StoreSettings
+    cameras: np.ndarray | None = None
     _last: tuple[MeshItem, RenderMesh] | None = None
 
     def mesh(self, item: MeshItem) -> RenderMesh:
@@ -107,29 +110,47 @@ class RenderContext:
             return (
                 str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
             )
-        settings = self.settings
-        rotations = np.stack(
-            [
-                view_rotation(
-                    settings.source,
-                    chunk.split,
-                    class_name=chunk.item.class_name,
-                    instance_id=chunk.item.instance_id,
-                    view=view,
-                    seed=settings.seed,
-                )
-                for view in range(chunk.start, chunk.stop)
-            ]
-        )
-        images = self._renderer().render(
-            mesh,
-            rotations,
-            camera=Camera(distance=settings.camera_distance, fov_deg=settings.camera_fov_deg),
-            image_size=settings.image_size,
-            modality=settings.modality,
-        )
-        write_chunk(chunk, ChunkData(images, rotations, mesh.object_from_mesh))
+        rotations = np.stack([view_rotation(**address) for address in self._addresses(chunk)])
+        try:
+            content = self._rows(mesh, rotations, chunk)
+        except MeshError as error:  # a view that shows nothing of the object
+            return str(error)
+        write_chunk(chunk, ChunkData(content, rotations, mesh.object_from_mesh))
         return None
+
+    def _addresses(self, chunk: Chunk) -> list[dict[str, Any]]:
+        """What the random numbers of each view depend on."""
+        return [
+            {
+                "dataset": self.settings.source,
+                "split": chunk.split,
+                "class_name": chunk.item.class_name,
+                "instance_id": chunk.item.instance_id,
+                "view": view,
+                "seed": self.settings.seed,
+            }
+            for view in range(chunk.start, chunk.stop)
+        ]
+
+    def _rows(self, mesh: RenderMesh, rotations: np.ndarray, chunk: Chunk) -> np.ndarray:
+        """Main array of the views: images, clouds or view sets.
+
+        Raises:
+            MeshError: if a partial cloud has no point.
+        """
+        settings = self.settings
+        camera = Camera(distance=settings.camera_distance, fov_deg=settings.camera_fov_deg)
+        drawing: dict[str, Any] = {"camera": camera, "image_size": settings.image_size}
+        if settings.num_points is not None:
+            if settings.modality == "partial_points":
+                return visible_clouds(
+                    self._renderer(), mesh, rotations, num_points=settings.num_points, **drawing
+                )
+            seeds = [surface_seed(**address) for address in self._addresses(chunk)]
+            return surface_clouds(mesh, rotations, seeds=seeds, num_points=settings.num_points)
+        if self.cameras is not None:
+            return view_sets(self._renderer(), mesh, rotations, cameras=self.cameras, **drawing)
+        return self._renderer().render(mesh, rotations, modality=settings.modality, **drawing)
 
     def _renderer(self) -> Renderer:
         if isinstance(self.renderer, str):
@@ -141,7 +162,7 @@ class RenderContext:
 
 def chunk_tag(settings: StoreSettings, item: MeshItem, fingerprint: str) -> str:
     """Hash of settings and mesh: a chunk file with another one is of no use."""
-    parts = [asdict(settings), item.class_name, item.instance_id, fingerprint]
+    parts = [settings.told(), item.class_name, item.instance_id, fingerprint]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -8,12 +8,12 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from i2i.data.content import content_notes, content_of
 from i2i.data.fingerprint import mesh_fingerprint
-from i2i.data.info import CHANNELS
 from i2i.data.render_guards import disk_errors, locked, progress_of
 from i2i.data.render_worker import (
     VIEWS_PER_CHUNK,
@@ -24,6 +24,7 @@ from i2i.data.render_worker import (
     read_chunk,
     render_chunks,
 )
+from i2i.data.settings import store_settings
 from i2i.data.sources.base import MeshItem, MeshSource
 from i2i.data.store import (
     SCHEMA_VERSION,
@@ -36,9 +37,10 @@ from i2i.data.store import (
     recover,
     write_store,
 )
-from i2i.errors import MeshError, RendererUnavailableError, StoreError
+from i2i.errors import MeshError, StoreError
 from i2i.geometry.cameras import Camera
-from i2i.rendering.base import Renderer, canonical_name, get_renderer
+from i2i.geometry.view_sets import camera_rotations
+from i2i.rendering.base import Renderer
 
 log = logging.getLogger(__name__)
 
@@ -47,43 +49,6 @@ MAX_WARNINGS = 10
 
 StorePaths = dict[tuple[str, str], Path]
 """Store folder of each (class name, split)."""
-
-
-def store_settings(
-    source: MeshSource,
-    *,
-    renderer: Renderer | str,
-    camera: Camera,
-    modality: str,
-    image_size: int,
-    seed: int,
-) -> StoreSettings:
-    """Settings of the stores that a source, a renderer and a camera make.
-
-    Raises:
-        ValueError: if the modality or the image size is not allowed.
-    """
-    if modality not in CHANNELS:
-        raise ValueError(f"data.modality={modality} is not known. Allowed: {', '.join(CHANNELS)}.")
-    if image_size < 1:
-        raise ValueError(f"data.image_size={image_size} is not allowed: give at least 1 pixel.")
-    name = canonical_name(renderer) if isinstance(renderer, str) else renderer.name
-    version = None
-    # A finished store can be used where its renderer is not installed.
-    with contextlib.suppress(RendererUnavailableError):
-        instance = get_renderer(renderer) if isinstance(renderer, str) else renderer
-        version = instance.version
-    return StoreSettings(
-        source=source.name,
-        up_axis=source.up_axis,
-        renderer=name,
-        renderer_version=version,
-        camera_distance=float(camera.distance),
-        camera_fov_deg=float(camera.fov_deg),
-        modality=modality,
-        image_size=image_size,
-        seed=seed,
-    )
 
 
 @dataclass
@@ -129,12 +94,15 @@ def render_store(
     modality: str = "gray",
     image_size: int = 128,
     seed: int = 0,
+    num_points: int | None = None,
+    camera_set: str | None = None,
+    cloud_image_size: int = 128,
     num_workers: int | None = None,
     strict: bool = False,
     overwrite: bool = False,
     progress: bool = True,
 ) -> StorePaths:
-    """Render what the stores lack of some objects and views; nothing if they have it all.
+    """Make what the stores lack of some objects and views; nothing if they have it all.
 
     Each view has a seed of its own, made from (source, split, class, object, view, seed), so a
     store that is extended is the same as one that was rendered at once. An interrupted run is
@@ -147,9 +115,12 @@ def render_store(
         root: Folder of all stores.
         renderer: Name of a renderer, or one.
         camera: Defaults to the paper's.
-        modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
-        image_size: Height and width in pixels.
+        modality: A key of `i2i.data.info.CHANNELS`.
+        image_size: Height and width of images and views in pixels.
         seed: Seed of the views.
+        num_points: See `store_settings`, as for the next two.
+        camera_set: See `store_settings`.
+        cloud_image_size: See `store_settings`.
         num_workers: Processes; None for one per processor, 0 for this one.
         strict: Stop at the first mesh that cannot be read, instead of leaving it out.
         overwrite: Render again what is there.
@@ -170,6 +141,9 @@ def render_store(
         modality=modality,
         image_size=image_size,
         seed=seed,
+        num_points=num_points,
+        camera_set=camera_set,
+        cloud_image_size=cloud_image_size,
     )
 
     def plans(*, fresh: bool) -> list[_Plan]:
@@ -182,7 +156,9 @@ def render_store(
     todo = plans(fresh=overwrite)
     if any(plan.chunks for plan in todo):
         base = Path(root) / settings.source / settings.key
-        context = RenderContext(source, renderer, settings)
+        # Here, and not in each process: the camera sets need torch.
+        cameras = None if camera_set is None else camera_rotations(camera_set)
+        context = RenderContext(source, renderer, settings, cameras)
         with disk_errors(base), locked(base):
             # Another process may have rendered all of it while this one waited for the lock.
             for plan in todo:
@@ -246,9 +222,10 @@ def _chunks(plan: _Plan, item: MeshItem, settings: StoreSettings, views: range) 
     """Tasks for some views of one object."""
     short = hashlib.sha256(item.instance_id.encode()).hexdigest()[:16]
     tag = chunk_tag(settings, item, plan.fingerprints[item.instance_id])
+    step = max(1, VIEWS_PER_CHUNK // content_of(settings.told()).pictures)
     chunks = []
-    for start in range(views.start, views.stop, VIEWS_PER_CHUNK):
-        stop = min(start + VIEWS_PER_CHUNK, views.stop)
+    for start in range(views.start, views.stop, step):
+        stop = min(start + step, views.stop)
         path = plan.chunk_folder / f"{short}-{start:06d}-{stop:06d}.npz"
         chunks.append(Chunk(item, plan.split, start, stop, path, tag))
     return chunks
@@ -328,12 +305,11 @@ def _assemble(context: RenderContext, plan: _Plan) -> None:
         plan.folder,
         {
             "schema": SCHEMA_VERSION,
-            "settings": asdict(context.settings),
+            "settings": context.settings.told(),
             "class": plan.class_name,
             "split": plan.split,
             "licence": context.source.licence,
-            "channels": CHANNELS[context.settings.modality],
-            "background": 255,
+            **content_notes(context.settings.modality),
             "views_per_instance": max(entry["views"] for entry in ordered),
             "items": ordered,
             "skipped": [skipped[name] for name in sorted(skipped)],
@@ -347,15 +323,15 @@ def _assemble(context: RenderContext, plan: _Plan) -> None:
 def _stored_runs(
     plan: _Plan, former: RenderedStore | None, entries: Sequence[dict[str, Any]]
 ) -> Iterator[StoredRun]:
-    """Images of each object in order: those of the former store, then the new chunks."""
+    """Rows of each object in order: those of the former store, then the new chunks."""
     had = {entry["id"]: entry["views"] for entry in former.card["items"]} if former else {}
     for name in (entry["id"] for entry in entries):
         if former is not None and name in had:
             rows = former.rows([name], views=range(had[name]))
-            yield StoredRun(name, 0, former.images[rows], former.rotations[rows])
+            yield StoredRun(name, 0, former.content[rows], former.rotations[rows])
         for chunk in plan.chunks.get(name, ()):
             data = _chunk_data(chunk)
-            yield StoredRun(name, chunk.start, data.images, data.rotations)
+            yield StoredRun(name, chunk.start, data.content, data.rotations)
 
 
 def _chunk_data(chunk: Chunk) -> ChunkData:

@@ -1,8 +1,8 @@
-"""The rendered store: images of one class and split as plain arrays on disk, with a card.
+"""The rendered store: rows of one class and split as plain arrays on disk, with a card.
 
-A store is the folder ``<root>/<source>/<key>/<class>/<split>/``. Its arrays are opened as memory
-maps. Its rows are ordered by object and view. The folder appears under its name only when all of
-it is written, so whatever carries the name is whole.
+A store is the folder ``<root>/<source>/<key>/<class>/<split>/``. Its main array (images, points or
+view sets) is opened as a memory map. Its rows are ordered by object and view. The folder appears
+under its name only when all of it is written, so whatever carries the name is whole.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
+from i2i.data.content import content_of
 from i2i.errors import StoreError, StoreMismatchError
 
 SCHEMA_VERSION = 1
 CARD = "card.json"
-ARRAYS = ("images", "rotations", "instances", "views")
+LABELS = ("rotations", "instances", "views")
 
 
 @dataclass(frozen=True)
 class StoreSettings:
-    """Everything that decides what the images of a store look like, but for the meshes.
+    """Everything that decides what the rows of a store hold, but for the meshes.
 
     Attributes:
         source: Name of the mesh source.
@@ -38,9 +39,12 @@ class StoreSettings:
         renderer_version: Its version; None if it is not installed, then it is not compared.
         camera_distance: Distance from the camera to the object's centre, in object radii.
         camera_fov_deg: Full field of view, in degrees.
-        modality: ``"gray"``, ``"depth"`` or ``"rgb"``.
-        image_size: Height and width in pixels.
+        modality: A key of `i2i.data.info.CHANNELS`.
+        image_size: Height and width in pixels of what is drawn: images, views, or the depth images
+            behind partial clouds; 0 where nothing is drawn.
         seed: Seed of the views.
+        num_points: Points of a cloud; None where there are none.
+        camera_set: Camera set of the views; None where there is none.
     """
 
     source: str
@@ -52,14 +56,22 @@ class StoreSettings:
     modality: str
     image_size: int
     seed: int
+    num_points: int | None = None
+    camera_set: str | None = None
+
+    def told(self) -> dict[str, Any]:
+        """Fields as a card tells them; those that the modality does not have are left out."""
+        fields = asdict(self)
+        return {k: v for k, v in fields.items() if v is not None or k == "renderer_version"}
 
     @property
     def key(self) -> str:
         """Folder name of these settings; versions are left out, they are checked in the card."""
-        fixed = {**asdict(self), "renderer_version": None, "schema": SCHEMA_VERSION}
+        fixed = {**self.told(), "renderer_version": None, "schema": SCHEMA_VERSION}
         digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:8]
+        size = f"{self.image_size}px" if self.num_points is None else f"{self.num_points}"
         name = self.renderer.partition(":")[0]  # its options are in the digest
-        return f"{self.modality}_{self.image_size}px_{name}_{digest}"
+        return f"{self.modality}_{size}_{name}_{digest}"
 
     def folder(self, root: str | os.PathLike[str], class_name: str, split: str) -> Path:
         """Folder of the store of one class and split."""
@@ -73,24 +85,25 @@ class StoredRun:
     Attributes:
         instance_id: Name of the object.
         first_view: Number of the first view.
-        images: Shape (N, C, H, W), uint8.
+        content: Main array, shape (N, ...): see `i2i.data.content`.
         rotations: Object to camera, shape (N, 3, 3), float64.
     """
 
     instance_id: str
     first_view: int
-    images: np.ndarray
+    content: np.ndarray
     rotations: np.ndarray
 
 
 @dataclass(frozen=True)
 class RenderedStore:
-    """An opened store; ``images`` is a memory map.
+    """An opened store; ``content`` is a memory map.
 
     Attributes:
         path: Folder of the store.
         card: Contents of ``card.json``.
-        images: Shape (N, C, H, W), uint8, background 255.
+        content: Images (N, C, H, W), uint8, background 255; points (N, P, 3), float32, in camera
+            axes and object radii; or view sets (N, V, C, H, W), uint8.
         rotations: Object to camera, shape (N, 3, 3), float64.
         instances: Index into ``card["items"]`` of each row, shape (N,), int32.
         views: Number of the view of each row, shape (N,), int32.
@@ -98,7 +111,7 @@ class RenderedStore:
 
     path: Path
     card: dict[str, Any]
-    images: np.ndarray
+    content: np.ndarray
     rotations: np.ndarray
     instances: np.ndarray
     views: np.ndarray
@@ -126,8 +139,9 @@ class RenderedStore:
             )
         if expected is not None:
             check_settings(card, expected, folder)
-        arrays = {name: _open_array(folder, card, name) for name in ARRAYS}
-        return cls(path=folder, card=card, **arrays)
+        content = _open_array(folder, card, content_of(card["settings"]).name, mmap_mode="r")
+        labels = {name: _open_array(folder, card, name) for name in LABELS}
+        return cls(path=folder, card=card, content=content, **labels)
 
     @property
     def instance_ids(self) -> list[str]:
@@ -159,7 +173,7 @@ class RenderedStore:
         Raises:
             StoreError: naming the first file that differs.
         """
-        for name in ARRAYS:
+        for name in self.card["arrays"]:
             file = self.path / f"{name}.npy"
             with file.open("rb") as stream:
                 found = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -216,15 +230,17 @@ def mesh_mismatch(folder: Path, instance_id: str) -> StoreMismatchError:
     )
 
 
-def _open_array(folder: Path, card: dict[str, Any], name: str) -> np.ndarray:
-    """Open one array (images as a memory map) and compare it with the card."""
+def _open_array(
+    folder: Path, card: dict[str, Any], name: str, mmap_mode: Literal["r"] | None = None
+) -> np.ndarray:
+    """Open one array and compare it with the card."""
     file, told = folder / f"{name}.npy", card["arrays"][name]
     try:
         size = file.stat().st_size
         # NumPy would map a truncated file without complaint until a missing page is touched.
         if size != told["bytes"]:
             raise ValueError(f"it has {size} bytes instead of {told['bytes']}")
-        array = np.load(file, mmap_mode="r" if name == "images" else None)
+        array = np.load(file, mmap_mode=mmap_mode)
     except (OSError, ValueError) as error:
         raise StoreError(
             f"{file} cannot be used: {error}. Delete the folder {folder} and run "
@@ -246,7 +262,7 @@ def write_store(
     Args:
         folder: Folder of the store.
         card: Card without ``counts`` and ``arrays``; ``card["items"]`` in the order of the rows.
-        runs: Images and rotations in the order of the rows; read once, one at a time.
+        runs: Content and rotations in the order of the rows; read once, one at a time.
         num_rows: Number of rows in all runs.
 
     Raises:
@@ -257,7 +273,9 @@ def write_store(
     temporary.mkdir(parents=True)
     try:
         arrays = _write_arrays(temporary, card, runs, num_rows)
-        counts = {"images": num_rows, "items": len(card["items"]), "skipped": len(card["skipped"])}
+        name = content_of(card["settings"]).name
+        rows = "images" if name == "images" else "rows"
+        counts = {rows: num_rows, "items": len(card["items"]), "skipped": len(card["skipped"])}
         text = json.dumps({**card, "counts": counts, "arrays": arrays}, indent=1, sort_keys=True)
         with (temporary / CARD).open("wb") as stream:
             stream.write(text.encode() + b"\n")
@@ -273,25 +291,25 @@ def _write_arrays(
 ) -> dict[str, dict[str, Any]]:
     """Write the four arrays; returns what the card says about them."""
     number = {item["id"]: index for index, item in enumerate(card["items"])}
-    size, channels = card["settings"]["image_size"], card["channels"]
+    content = content_of(card["settings"])
     rotations = np.zeros((num_rows, 3, 3))
     instances = np.zeros(num_rows, np.int32)
     views = np.zeros(num_rows, np.int32)
 
-    def image_bytes() -> Iterator[bytes]:
+    def content_bytes() -> Iterator[bytes]:
         row = 0
         for run in runs:
-            here = slice(row, row + len(run.images))
+            here = slice(row, row + len(run.content))
             rotations[here] = run.rotations
             instances[here] = number[run.instance_id]
-            views[here] = run.first_view + np.arange(len(run.images))
+            views[here] = run.first_view + np.arange(len(run.content))
             row = here.stop
-            yield np.ascontiguousarray(run.images, np.uint8).tobytes()
+            yield np.ascontiguousarray(run.content, content.dtype).tobytes()
         if row != num_rows:
             raise AssertionError(f"{row} rows came for a store of {num_rows}")
 
-    shape = (num_rows, channels, size, size)
-    told = {"images": _write_array(folder / "images.npy", shape, np.dtype(np.uint8), image_bytes())}
+    shape, main = (num_rows, *content.shape), folder / f"{content.name}.npy"
+    told = {content.name: _write_array(main, shape, content.dtype, content_bytes())}
     for name, array in (("rotations", rotations), ("instances", instances), ("views", views)):
         file = folder / f"{name}.npy"
         told[name] = _write_array(file, array.shape, array.dtype, [array.tobytes()])
