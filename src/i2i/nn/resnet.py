@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from i2i.nn.log_polar import CircularRowsConv2d, CircularRowsMaxPool2d
+
 _BLOCKS_PER_LAYER = 2
 
 
@@ -14,13 +16,17 @@ class BasicBlock(nn.Module):
         out_channels: Channels out.
         stride: Of the first convolution and of the shortcut, which is a 1×1 convolution with batch
             norm where the stride or the width changes.
+        circular_rows: Whether the rows go round in a circle.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1) -> None:
+    def __init__(
+        self, in_channels: int, out_channels: int, *, stride: int = 1, circular_rows: bool = False
+    ) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, 1, bias=False)
+        conv = CircularRowsConv2d if circular_rows else nn.Conv2d
+        self.conv1 = conv(in_channels, out_channels, 3, stride, 1, bias=False)
         self.norm1 = nn.BatchNorm2d(out_channels)
-        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, 1, 1, bias=False)
+        self.conv2 = conv(out_channels, out_channels, 3, 1, 1, bias=False)
         self.norm2 = nn.BatchNorm2d(out_channels)
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or in_channels != out_channels:
@@ -39,7 +45,8 @@ class BasicBlock(nn.Module):
 class ResNet18(nn.Module):
     """ResNet-18 with a 5×5 stem, stride 2 in the first two layers and 1 in the last two.
 
-    The trunk only: pooling and heads belong to the models. Not pretrained, as in the paper.
+    The trunk only: pooling and heads belong to the models. Not pretrained, as in the paper. With
+    `stem_size=7` and `layer_strides=(1, 2, 2, 2)` it is the standard ResNet-18.
 
     Args:
         in_channels: 1 for gray and depth, 3 for RGB.
@@ -47,6 +54,9 @@ class ResNet18(nn.Module):
         image_size: Side of the square image in pixels.
         layer_strides: Stride of each layer's first block.
         max_pool: Whether the stem ends with a 3×3 max-pool of stride 2.
+        stem_size: Side of the stem's kernel, odd.
+        circular_rows: Whether the rows go round in a circle, as those of `LogPolar` do: every layer
+            pads them with the rows of the other end instead of zeros.
 
     Attributes:
         out_channels: 8 · width.
@@ -54,6 +64,9 @@ class ResNet18(nn.Module):
 
     Shape:
         (B, in_channels, image_size, image_size) -> (B, out_channels, S, S).
+
+    Raises:
+        ValueError: If the stem's kernel has an even side.
 
     Example:
         >>> ResNet18(1, width=4, image_size=64)(torch.ones(2, 1, 64, 64)).shape
@@ -68,13 +81,19 @@ class ResNet18(nn.Module):
         image_size: int,
         layer_strides: tuple[int, ...] = (2, 2, 1, 1),
         max_pool: bool = True,
+        stem_size: int = 5,
+        circular_rows: bool = False,
     ) -> None:
         super().__init__()
+        if stem_size % 2 == 0:
+            raise ValueError(f"stem_size={stem_size} must be odd")
         self.in_channels, self.image_size = in_channels, image_size
         self.out_channels = width * 2 ** (len(layer_strides) - 1)
-        self.stem = nn.Conv2d(in_channels, width, 5, stride=2, padding=2, bias=False)
+        conv = CircularRowsConv2d if circular_rows else nn.Conv2d
+        pool = CircularRowsMaxPool2d if circular_rows else nn.MaxPool2d
+        self.stem = conv(in_channels, width, stem_size, 2, stem_size // 2, bias=False)
         self.norm = nn.BatchNorm2d(width)
-        self.max_pool = nn.MaxPool2d(3, stride=2, padding=1) if max_pool else nn.Identity()
+        self.max_pool = pool(3, 2, 1) if max_pool else nn.Identity()
 
         blocks: list[nn.Module] = []
         channels = width
@@ -86,7 +105,11 @@ class ResNet18(nn.Module):
             for index in range(_BLOCKS_PER_LAYER):
                 out_channels = width * 2**layer
                 stride_here = stride if index == 0 else 1
-                blocks.append(BasicBlock(channels, out_channels, stride=stride_here))
+                blocks.append(
+                    BasicBlock(
+                        channels, out_channels, stride=stride_here, circular_rows=circular_rows
+                    )
+                )
                 channels = out_channels
         self.blocks = nn.Sequential(*blocks)
         self.map_size = size
