@@ -16,12 +16,11 @@ from rich.table import Table
 from torch import nn
 
 from i2i.configuration import compose
-from i2i.data.info import DataInfo
 from i2i.models.i2i import I2IClassifier, I2IPose
 from i2i.nn.encoders import C4ResNet18, ResNet18
 from i2i.nn.group_convs import DynamicFilterConv
 from i2i.nn.projectors import IcosahedralProjector
-from i2i.runs.building import build_network
+from i2i.runs.building import build_network, info_of
 
 
 @dataclass(frozen=True)
@@ -71,16 +70,10 @@ def classifier() -> I2IClassifier:
     )
 
 
-def composed(model: str, task: str = "pose", *, classes: int = 1, channels: int = 1) -> nn.Module:
+def composed(model: str, task: str = "pose", *, classes: int = 1, words: str = "") -> nn.Module:
     """A network of `conf/model` at the paper's scale."""
-    info = DataInfo(
-        tuple(f"class {i}" for i in range(classes)),
-        ("none",) * classes,
-        channels=channels,
-        image_size=128,
-        modality="rgb" if channels == 3 else "gray",
-    )
-    return build_network(compose([f"model={model}", f"task={task}", "scale=paper"]), info)
+    config = compose([f"model={model}", f"task={task}", "scale=paper", *words.split()])
+    return build_network(config, info_of(config, tuple(f"class {i}" for i in range(classes))))
 
 
 SYSTEMS = (
@@ -102,13 +95,45 @@ SYSTEMS = (
     System("CNN+GS", "11.2 M", 11_176_006, partial(composed, "cnn_gs")),
     System("CNN+Proc", "11.2 M", 11_177_545, partial(composed, "cnn_procrustes")),
     System("CNN+S3exp", "27.6 M", 27_595_332, partial(composed, "cnn_s3exp")),
-    System("CNN+S3exp, RGB", "27.6 M", 27_601_604, partial(composed, "cnn_s3exp", channels=3)),
+    System(
+        "CNN+S3exp, RGB",
+        "27.6 M",
+        27_601_604,
+        partial(composed, "cnn_s3exp", words="data.modality=rgb"),
+    ),
     System("CNN+IER", "11.4 M", 11_444_818, partial(composed, "cnn_ier")),
     System("E2CNN-Eq", "", 10_585_058, partial(composed, "e2cnn_eq")),
     System("I2I, classification", "", 12_149_636, classifier),
     System("CNN", "", 11_193_448, partial(composed, "cnn", "classification", classes=40)),
     System(
         "E2CNN-Inv", "", 10_594_820, partial(composed, "e2cnn_inv", "classification", classes=40)
+    ),
+    System("KPConv, pose, one anchor", "", 1_656_260, partial(composed, "kpconv")),
+    System("EPN, pose", "", 3_024_101, partial(composed, "epn")),
+    System(
+        "EPN, pose, six numbers",
+        "",
+        3_024_231,
+        partial(composed, "epn", words="model.networks.pose.representation=six"),
+    ),
+    *(
+        System(name, "", expected, partial(composed, model, "classification", classes=40))
+        for name, expected, model in (
+            ("PointNet++", 1_475_688, "pointnet2"),
+            ("KPConv, classification", 6_143_688, "kpconv"),
+            ("EPN, classification", 7_814_889, "epn"),
+            ("RotationNet-20", 11_597_172, "rotationnet_20"),
+            ("EMVN-12", 21_425_768, "emvn_12"),
+            ("EMVN, 60 views", 21_687_912, "emvn_60"),
+        )
+    ),
+    System(
+        "RotationNet-20, AlexNet",
+        "",
+        60_363_380,
+        partial(
+            composed, "rotationnet_20", "classification", classes=40, words="model/trunk=alexnet"
+        ),
     ),
 )
 

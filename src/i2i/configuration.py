@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,7 @@ def register_resolvers() -> None:
         "i2i.slug": slug,
         "i2i.started": lambda: _STARTED,
         "i2i.image_size": _image_size,
+        "i2i.modality": _first_modality,
         "i2i.coverage": _coverage,
         "i2i.run_dir": _run_dir,
     }
@@ -93,6 +94,18 @@ def _label_frame(frame: str, field: str) -> str:
             "model.group_frame and model.projector_axes one by one"
         )
     return LABEL_FRAMES[frame][field]
+
+
+def modalities(seen: Any, task: str) -> list[str]:  # noqa: ANN401 - a YAML value
+    """What a model sees, from its `modalities`: a list, or a list for each task."""
+    if isinstance(seen, Mapping):
+        seen = seen.get(task) or []
+    return list(seen)
+
+
+def _first_modality(seen: Any, task: str) -> str:  # noqa: ANN401 - a YAML value
+    # A model without the task is refused later, by name.
+    return next(iter(modalities(seen, task)), "gray")
 
 
 def _image_size(size: int, stem_mode: str | None) -> int:

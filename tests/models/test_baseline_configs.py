@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from i2i.configuration import compose
-from i2i.data.info import CHANNELS, DataInfo
+from i2i.data.info import CHANNELS, IMAGES, DataInfo
 from i2i.errors import ConfigurationError
 from i2i.geometry.rotations import random_rotations
 from i2i.runs.building import build_network, check_fit
@@ -55,7 +55,7 @@ def run(network, info, n=2):
 
 
 @pytest.mark.parametrize(("model", "task"), ALL)
-@pytest.mark.parametrize("modality", list(CHANNELS))
+@pytest.mark.parametrize("modality", IMAGES)
 def test_tiny_sees_every_modality(model, task, modality):
     for classes in (1, 2) if task == "pose" else (3,):
         losses = run(*build(model, task, scale="tiny", modality=modality, classes=classes))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from i2i.nn.precision import full_precision
 
-REG_ON = ("auto", "correct_only", "gt_always", "within_57deg")
+REG_ON = ("auto", "correct_only", "gt_always", "within_57deg", "sum_within_57deg")
 LABELS = ("hard", "soft")
 WITHIN_RAD = 1.0  # 57.3°: an element's neighbours are 72° away
 
@@ -54,8 +54,9 @@ class ClassifyThenRegressLoss(nn.Module):
         reg_on: Which elements' residuals are trained. `"correct_only"`: the predicted one where it
             is the nearest to the target; others count as 0 in the mean (paper). `"gt_always"`: the
             nearest one. `"within_57deg"`: all within 1 rad of the target, in equal parts, or
-            weighted by the soft labels. `"auto"`: `correct_only` with hard labels, `within_57deg`
-            with soft ones.
+            weighted by the soft labels. `"sum_within_57deg"`: the same ones, each in full whatever
+            the labels (EPN). `"auto"`: `correct_only` with hard labels, `within_57deg` with soft
+            ones.
         labels: `"hard"`: the nearest element. `"soft"`: softmax(−(angle / soft_width_rad)²).
         soft_width_rad: Width of the soft labels in radians.
         squared: Square the norm (the paper does not).
@@ -90,8 +91,10 @@ class ClassifyThenRegressLoss(nn.Module):
 
     def residual_weights(self, logits: Tensor, target: GroupTarget) -> Tensor:
         """How much each element's residual counts for each sample: (B, K)."""
-        if self.reg_on == "within_57deg":
+        if self.reg_on in ("within_57deg", "sum_within_57deg"):
             near = (target.angle_rad < WITHIN_RAD).to(logits.dtype)
+            if self.reg_on == "sum_within_57deg":
+                return near
             if self.labels == "soft":
                 return near * self.soft_labels(target).to(logits.dtype)
             # Every rotation is within 44.5° of an element, so the sum is never 0.

@@ -5,11 +5,10 @@ from pathlib import Path
 from hydra.errors import InstantiationException
 
 from i2i.configuration import compose, config_dir
-from i2i.data.info import CHANNELS, DataInfo
 from i2i.errors import I2IError
 from i2i.reports.model import Cell, Column, Report, Row, Section
 from i2i.reports.paper import Paper
-from i2i.runs.building import build_network
+from i2i.runs.building import build_network, info_of
 
 POSE, CLASSIFICATION = "pose", "classification"
 CLASSES = {POSE: 1, CLASSIFICATION: 40}
@@ -30,19 +29,14 @@ def count_parameters(model: str, task: str, *, scale: str = "paper") -> int | No
         scale: Name of a scale.
 
     Returns:
-        The count for gray images, or for the first modality that the model sees; None where the
+        The count for the first modality that the model sees; None where the
         model has no network for the task.
     """
     cfg = compose([f"model={model}", f"task={task}", f"scale={scale}", "data=modelnet40"])
     if cfg.model.networks.get(task) is None:
         return None
-    seen = list(cfg.model.modalities)
-    modality = "gray" if "gray" in seen else seen[0]
     names = tuple(f"class {index}" for index in range(CLASSES[task]))
-    info = DataInfo(
-        names, ("none",) * len(names), CHANNELS[modality], cfg.data.image_size, modality
-    )
-    network = build_network(cfg, info)
+    network = build_network(cfg, info_of(cfg, names))
     return sum(p.numel() for p in network.parameters() if p.requires_grad)
 
 

@@ -6,10 +6,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from i2i.configuration import plain
-from i2i.data.info import DataInfo
+from i2i.configuration import modalities, plain
+from i2i.data.info import CHANNELS, CLOUDS, VIEWS, DataInfo
 from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError
+from i2i.geometry.view_sets import num_views
 from i2i.tasks.base import Task
 
 Config = DictConfig | dict[str, Any]
@@ -66,12 +67,30 @@ def build_network(config: Config, info: DataInfo) -> nn.Module:
     """The network of a configuration for its task, with fresh weights."""
     config = _as_config(config)
     network: nn.Module = instantiate(
-        config.model.networks[config.task.name],
-        channels=info.channels,
-        num_classes=info.num_classes,
-        image_size=info.image_size,
+        config.model.networks[config.task.name], **info.network_arguments()
     )
     return network
+
+
+def info_of(config: DictConfig, class_names: tuple[str, ...] = ("object",)) -> DataInfo:
+    """What a configuration's data would be for some classes, without any meshes.
+
+    Args:
+        config: A composed configuration of the train door.
+        class_names: The classes, without symmetries.
+    """
+    data = config.data
+    cameras = data.get("camera_set") if data.modality == VIEWS else None
+    return DataInfo(
+        class_names,
+        ("none",) * len(class_names),
+        channels=CHANNELS[data.modality],
+        image_size=data.image_size,
+        modality=data.modality,
+        num_points=data.num_points if data.modality in CLOUDS else None,
+        num_views=num_views(cameras) if cameras else None,
+        camera_set=cameras,
+    )
 
 
 def check_fit(config: DictConfig) -> None:
@@ -87,10 +106,11 @@ def check_fit(config: DictConfig) -> None:
             f"model={model.name} has no network for task={task}; it has one for "
             f"{', '.join(f'task={name}' for name in tasks)}"
         )
-    if config.data.modality not in model.modalities:
+    seen = modalities(model.modalities, task)
+    if config.data.modality not in seen:
         raise ConfigurationError(
             f"model={model.name} does not see data.modality={config.data.modality}; it sees "
-            f"{', '.join(f'data.modality={name}' for name in model.modalities)}"
+            f"{', '.join(f'data.modality={name}' for name in seen)}"
         )
 
 

@@ -20,6 +20,11 @@ _LEFT_OUT_OF_TRAINER = (
     "use_distributed_sampler", "deterministic", "benchmark", "detect_anomaly", "profiler",
     "default_root_dir", "barebones", "logger", "callbacks",
 )  # fmt: skip
+_OF_CLOUDS = (
+    "num_points", "cloud_image_size", "rotate_points", "point_dropout", "point_scale",
+    "point_shift", "point_noise",
+)  # fmt: skip
+_OF_IMAGES = ("image_size", "shift_px", "test_shift_px", "depth_shift", "test_depth_shift")
 # These watch a run; any other callback may change it.
 _WATCHING = (
     "checkpoint_last", "checkpoint_best", "record", "learning_rate", "guard", "images",
@@ -55,8 +60,16 @@ def identity_config(config: dict[str, Any]) -> dict[str, Any]:
     return normal
 
 
+def _settings_of_others(modality: str) -> tuple[str, ...]:
+    """Settings that say nothing about data of this modality."""
+    if modality not in ("partial_points", "full_points"):
+        return _OF_CLOUDS
+    return (*_OF_IMAGES, *(() if modality == "partial_points" else ("cloud_image_size",)))
+
+
 def _identity_of_data(data: dict[str, Any]) -> dict[str, Any]:
-    kept = {k: v for k, v in data.items() if k not in _LEFT_OUT_OF_DATA}
+    out = (*_LEFT_OUT_OF_DATA, *_settings_of_others(str(data.get("modality"))))
+    kept = {k: v for k, v in data.items() if k not in out}
     name, root = data.get("name"), str(data.get("root"))
     if name in _ROOT_IS_THE_DATASET or _USUAL_ROOT.get(str(name), root) != root:
         kept["root"] = str(Path(root).resolve())

@@ -38,9 +38,22 @@ def load_task(path: Path) -> Task:
     """
     checkpoint = read_checkpoint(path)
     ours = checkpoint["i2i"]
-    task = build_task(ours["config"], DataInfo.from_dict(ours["data"]))
+    config = ours["config"]
+    if config["model"].get("pretrained"):  # all weights are in the checkpoint
+        config = {**config, "model": _without_pretrained(config["model"])}
+    task = build_task(config, DataInfo.from_dict(ours["data"]))
+    task.run_config = ours["config"]
     load_weights(task, checkpoint, path)
     return task.eval()
+
+
+def _without_pretrained(model: dict[str, Any]) -> dict[str, Any]:
+    """A resolved model that starts from scratch."""
+    networks = {
+        task: network if network is None else {**network, "pretrained": None}
+        for task, network in model["networks"].items()
+    }
+    return {**model, "pretrained": None, "networks": networks}
 
 
 def load_weights(task: Task, checkpoint: dict[str, Any], path: Path) -> None:
