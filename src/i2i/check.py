@@ -4,15 +4,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
 
 from i2i.cli import door
 from i2i.configuration import register_resolvers
-from i2i.data.info import DataInfo
+from i2i.data.noise import noise_batch
 from i2i.errors import ConfigurationError, I2IError
+from i2i.rendering.base import MODALITIES
 from i2i.runs.building import build_datamodule, follow_root
 from i2i.runs.folder import write_json
 from i2i.runs.loading import load_task, locate
@@ -44,7 +44,12 @@ def check(cfg: DictConfig) -> dict[str, Any]:
     register_resolvers()
     folder, checkpoint = locate(cfg.run, cfg.ckpt)
     task = load_task(checkpoint)
-    batch, notice = _noise(task.info, cfg.images), ""
+    if task.info.modality not in MODALITIES:
+        raise ConfigurationError(
+            f"the network of {folder.path.name} sees {task.info.modality}, and this command turns "
+            f"images: give a run with data.modality={' | '.join(MODALITIES)}"
+        )
+    batch, notice = noise_batch(task.info, cfg.images), ""
     if not cfg.noise:
         batch, notice = _test_images(cfg, task.run_config, batch)
     network = task.network.to(cfg.device)
@@ -66,19 +71,6 @@ def check(cfg: DictConfig) -> dict[str, Any]:
     figure = equivariance_figure(rows, tolerance=cfg.tolerance, heading=heading)
     save_figure(figure, output / "equivariance.png")
     return {**content, "rows": rows, "output": str(output)}
-
-
-def _noise(info: DataInfo, count: int) -> dict[str, Tensor]:
-    """A batch of noise, the same one each time."""
-    generator = torch.Generator().manual_seed(0)
-    shape = (count, info.channels, info.image_size, info.image_size)
-    return {
-        "image": torch.rand(shape, generator=generator),
-        "rotation": torch.eye(3).expand(count, 3, 3),
-        "class_id": torch.arange(count) % info.num_classes,
-        "instance_id": torch.arange(count),
-        "view_id": torch.zeros(count, dtype=torch.long),
-    }
 
 
 def _test_images(

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from i2i.cli import door
 from i2i.configuration import register_resolvers
+from i2i.data.point_files import SUFFIXES
 from i2i.errors import ImageError
 from i2i.prediction_results import PoseResult
 from i2i.predictor import load
 from i2i.runs.loading import locate
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+CLOUDS = SUFFIXES
 
 
 def predict(cfg: DictConfig) -> dict[str, Any]:
-    """Predict for one picture or each picture of a folder; writes a picture and a JSON for each.
+    """Predict for one picture or cloud, or each of a folder; writes a picture and a JSON for each.
 
     Args:
         cfg: The composed configuration of this door.
@@ -37,12 +40,14 @@ def predict(cfg: DictConfig) -> dict[str, Any]:
     options = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(options, dict)
     results: dict[str, Any] = {}
-    pictures = _pictures(Path(cfg.input))
+    pictures = _inputs(Path(cfg.input), CLOUDS if predictor.info.num_points else PICTURES)
     stems = Counter(path.stem for path in pictures)
     for path in pictures:
         result = predictor.predict(
             path,
-            **{k: options[k] for k in ("class_name", "mask", "box", "intrinsics", "margin")},
+            **{
+                k: options[k] for k in ("class_name", "mask", "box", "intrinsics", "margin", "axes")
+            },
         )
         # "_pose" or "_class": an answer beside its picture never takes the picture's own name.
         stem = path.stem if stems[path.stem] == 1 else path.name.replace(".", "_")
@@ -56,14 +61,16 @@ def predict(cfg: DictConfig) -> dict[str, Any]:
     return results
 
 
-def _pictures(given: Path) -> list[Path]:
+def _inputs(given: Path, suffixes: Sequence[str]) -> list[Path]:
     if given.is_dir():
-        found = sorted(p for p in given.iterdir() if p.suffix.lower() in PICTURES)
+        found = sorted(p for p in given.iterdir() if p.suffix.lower() in suffixes)
         if not found:
-            raise ImageError(f"input={given}: no picture there ({', '.join(PICTURES)})")
+            raise ImageError(f"input={given}: no input there ({', '.join(suffixes)})")
         return found
     if not given.exists():
-        raise ImageError(f"input={given}: no such file; give a picture or a folder of pictures")
+        raise ImageError(
+            f"input={given}: no such file; give one of {', '.join(suffixes)}, or a folder"
+        )
     return [given]
 
 

@@ -67,7 +67,8 @@ class PoseResult:
         confidence: Probability mass of the answer; None for a network without a distribution.
         alternatives: Up to three other answers, the most probable first.
         warnings: What looked wrong with the picture.
-        crop_box: (x0, y0, x1, y1) of what the network saw, in pixels of the picture.
+        crop_box: (x0, y0, x1, y1) of what the network saw, in pixels of the picture; None for a
+            cloud.
         drawing: What `draw` uses.
     """
 
@@ -79,7 +80,7 @@ class PoseResult:
     confidence: float | None
     alternatives: tuple[Alternative, ...]
     warnings: tuple[str, ...]
-    crop_box: tuple[float, float, float, float]
+    crop_box: tuple[float, float, float, float] | None
     drawing: Drawing
 
     def __str__(self) -> str:
@@ -119,7 +120,7 @@ class PoseResult:
                 {"rotation": other.rotation.tolist(), "probability": other.probability}
                 for other in self.alternatives
             ],
-            "crop_box": list(self.crop_box),
+            "crop_box": None if self.crop_box is None else list(self.crop_box),
             "warnings": list(self.warnings),
         }
 
@@ -166,7 +167,8 @@ class ClassResult:
         confidence: Its probability.
         probabilities: Of every class, the most probable first.
         warnings: What looked wrong with the picture.
-        crop_box: (x0, y0, x1, y1) of what the network saw, in pixels of the picture.
+        crop_box: (x0, y0, x1, y1) of what the network saw, in pixels of the picture; None for a
+            cloud.
         drawing: What `draw` uses.
     """
 
@@ -174,7 +176,7 @@ class ClassResult:
     confidence: float
     probabilities: dict[str, float]
     warnings: tuple[str, ...]
-    crop_box: tuple[float, float, float, float]
+    crop_box: tuple[float, float, float, float] | None
     drawing: Drawing
 
     def __str__(self) -> str:
@@ -194,7 +196,7 @@ class ClassResult:
             "class_name": self.class_name,
             "confidence": self.confidence,
             "probabilities": dict(self.probabilities),
-            "crop_box": list(self.crop_box),
+            "crop_box": None if self.crop_box is None else list(self.crop_box),
             "warnings": list(self.warnings),
         }
 

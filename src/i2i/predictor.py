@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from i2i.data.info import DataInfo
-from i2i.data.photographs import PreparedImage, prepare_photograph
+from i2i.data.photographs import prepare_photograph
 from i2i.data.pictures import Picture
+from i2i.data.point_files import Cloud, prepare_cloud
 from i2i.errors import CheckpointError, ConfigurationError
 from i2i.geometry.cameras import Camera
 from i2i.geometry.rotations import euler_deg_from_rotation, quaternion_xyzw_from_rotation
@@ -23,11 +25,22 @@ from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.reference import load_mesh
 from i2i.runs.loading import load_task, locate
+from i2i.viz.inputs import input_pictures
 
 SAME_ANSWER_DEG = 15.0
 """Candidates closer than this to a better one count as the same answer; their mass is added up."""
 
 _NUM_ALTERNATIVES = 3
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the network gets (without the class), and what was done to it."""
+
+    batch: dict[str, Tensor]
+    crop_box: tuple[float, float, float, float] | None
+    warnings: tuple[str, ...]
+    camera_from_crop: np.ndarray
 
 
 class Predictor:
@@ -66,8 +79,14 @@ class Predictor:
         """Network, classes and input."""
         return (
             f"Predictor({type(self.network).__name__}, {', '.join(self.info.class_names)}; "
-            f"{self.info.modality}, {self.info.image_size} px)"
+            f"{self.info.modality}, {self._input_size()})"
         )
+
+    def _input_size(self) -> str:
+        if self.info.num_points is not None:
+            return f"{self.info.num_points} points"
+        views = "" if self.info.num_views is None else f"{self.info.num_views} × "
+        return f"{views}{self.info.image_size} px"
 
     @cached_property
     def reference_meshes(self) -> dict[str, RenderMesh]:
@@ -90,18 +109,20 @@ class Predictor:
 
     def predict(
         self,
-        image: Picture,
+        image: Picture | Cloud,
         *,
         class_name: str | None = None,
         mask: Picture | None = None,
         box: Sequence[float] | None = None,
         intrinsics: Sequence[float] | None = None,
         margin: float = 1.0,
+        axes: str = "opengl",
     ) -> PoseResult | ClassResult:
-        """Say how the object in a picture is turned, or of which class it is.
+        """Say how the object in a picture or a cloud is turned, or of which class it is.
 
         Args:
-            image: Path, PIL image or array (H, W), (H, W, 1 | 3 | 4).
+            image: Path, PIL image or array (H, W), (H, W, 1 | 3 | 4); for a network of clouds a
+                path or an array (N, 3), the points of the object alone.
             class_name: Class of the object; needed by a pose network of several classes.
             mask: Picture of the same size, non-zero on the object; else the image's alpha is used.
             box: (x0, y0, x1, y1) around the object in pixels.
@@ -109,6 +130,8 @@ class Predictor:
                 this camera's frame, without them into the frame of a camera that looks at the
                 middle of the crop.
             margin: Factor on the side of the crop; above 1 the object becomes smaller.
+            axes: Camera axes of a cloud, see `i2i.data.point_files.prepare_cloud`. The answer is
+                always in axes x right, y up, z to the viewer.
 
         Returns:
             A `PoseResult` or a `ClassResult`, depending on the network.
@@ -120,26 +143,56 @@ class Predictor:
         """
         if class_name is not None:
             self._check_class(class_name)
+        if self.info.num_points is not None:
+            seen = self._see_cloud(image, axes, mask=mask, box=box, intrinsics=intrinsics)
+        else:
+            seen = self._see_picture(image, mask, box, intrinsics, margin)
+        batch = {name: tensor.to(self.device) for name, tensor in seen.batch.items()}
+        chosen = class_name or self.info.class_names[0]
+        batch["class_id"] = torch.tensor([self.info.class_names.index(chosen)], device=self.device)
+        with torch.inference_mode():
+            prediction = self.network(batch)
+        if not isinstance(prediction, PosePrediction):
+            return self._class_result(prediction.logits, seen)
+        if class_name is None and self.info.num_classes > 1:
+            raise ConfigurationError(
+                "This network was trained for several classes and looks at each with its own "
+                f"weights: add class_name=, one of {', '.join(self.info.class_names)}."
+            )
+        return self._pose_result(prediction, seen, class_name=chosen)
+
+    def _see_picture(
+        self, image: Any, mask: Any, box: Any, intrinsics: Any, margin: float  # noqa: ANN401
+    ) -> _Seen:  # fmt: skip
+        """A picture as an image network wants it."""
+        if self.info.num_views is not None:
+            raise ConfigurationError(
+                f"This network looks at {self.info.num_views} views of one object at once, from "
+                "fixed cameras around it: it cannot answer for a single picture. Use a run with "
+                "data.modality=gray | depth | rgb."
+            )
         prepared = prepare_photograph(
             image, channels=self.info.channels, image_size=self.info.image_size,
             background=self.info.background, mask=mask, box=box, intrinsics=intrinsics,
             margin=margin,
             camera=Camera(distance=self.info.camera_distance, fov_deg=self.info.camera_fov_deg),
         )  # fmt: skip
-        batch = {"image": prepared.tensor.to(self.device)}
-        chosen = class_name or self.info.class_names[0]
-        batch["class_id"] = torch.tensor([self.info.class_names.index(chosen)], device=self.device)
-        with torch.inference_mode():
-            prediction = self.network(batch)
-        warnings = (*prepared.warnings, *self._modality_warnings())
-        if not isinstance(prediction, PosePrediction):
-            return self._class_result(prediction.logits, prepared, warnings)
-        if class_name is None and self.info.num_classes > 1:
+        return _Seen(
+            {"image": prepared.tensor}, prepared.crop_box,
+            (*prepared.warnings, *self._modality_warnings()), prepared.camera_from_crop,
+        )  # fmt: skip
+
+    def _see_cloud(self, cloud: Any, axes: str, **of_pictures: Any) -> _Seen:  # noqa: ANN401
+        """A cloud as a point network wants it."""
+        given = [name for name, value in of_pictures.items() if value is not None]
+        if given:
             raise ConfigurationError(
-                "This network was trained for several classes and looks at each with its own "
-                f"weights: add class_name=, one of {', '.join(self.info.class_names)}."
+                f"{given[0]}= is for pictures, and this network sees {self.info.modality}: "
+                "give the points of the object alone"
             )
-        return self._pose_result(prediction, prepared, warnings, class_name=chosen)
+        assert self.info.num_points is not None
+        points = prepare_cloud(cloud, num_points=self.info.num_points, axes=axes)
+        return _Seen({"points": points}, None, (), np.eye(3))
 
     def _check_class(self, class_name: str) -> None:
         if class_name not in self.info.class_names:
@@ -157,18 +210,13 @@ class Predictor:
         )
 
     def _pose_result(
-        self,
-        prediction: PosePrediction,
-        prepared: PreparedImage,
-        warnings: tuple[str, ...],
-        *,
-        class_name: str,
+        self, prediction: PosePrediction, seen: _Seen, *, class_name: str
     ) -> PoseResult:
         symmetry = self.info.symmetry[self.info.class_names.index(class_name)]
         best = prediction.rotation[0].double().cpu()
         _check_finite(best)
         answers = _distinct_answers(prediction, best, symmetry=symmetry)
-        turn = torch.from_numpy(prepared.camera_from_crop)
+        turn = torch.from_numpy(seen.camera_from_crop)
         rotation = turn @ best
         return PoseResult(
             class_name=class_name,
@@ -181,19 +229,12 @@ class Predictor:
                 Alternative(rotation=(turn @ other).numpy(), probability=probability)
                 for other, probability in answers[1 : 1 + _NUM_ALTERNATIVES]
             ),
-            warnings=warnings,
-            crop_box=prepared.crop_box,
-            drawing=Drawing(
-                image=prepared.tensor[0].numpy(),
-                info=self.info,
-                mesh=self.reference_meshes.get(class_name),
-                camera_from_crop=prepared.camera_from_crop,
-            ),
+            warnings=seen.warnings,
+            crop_box=seen.crop_box,
+            drawing=self._drawing(seen, self.reference_meshes.get(class_name)),
         )
 
-    def _class_result(
-        self, logits: Tensor, prepared: PreparedImage, warnings: tuple[str, ...]
-    ) -> ClassResult:
+    def _class_result(self, logits: Tensor, seen: _Seen) -> ClassResult:
         _check_finite(logits)
         probabilities = torch.softmax(logits[0].double().cpu(), dim=0)
         ranked = torch.argsort(probabilities, descending=True, stable=True).tolist()
@@ -202,13 +243,18 @@ class Predictor:
             class_name=names[ranked[0]],
             confidence=float(probabilities[ranked[0]]),
             probabilities={names[index]: float(probabilities[index]) for index in ranked},
-            warnings=warnings,
-            crop_box=prepared.crop_box,
-            drawing=Drawing(
-                image=prepared.tensor[0].numpy(), info=self.info, mesh=None,
-                camera_from_crop=np.eye(3),
-            ),
-        )  # fmt: skip
+            warnings=seen.warnings,
+            crop_box=seen.crop_box,
+            drawing=self._drawing(seen, None),
+        )
+
+    def _drawing(self, seen: _Seen, mesh: RenderMesh | None) -> Drawing:
+        return Drawing(
+            image=input_pictures(seen.batch)[0],
+            info=self.info,
+            mesh=mesh,
+            camera_from_crop=seen.camera_from_crop,
+        )
 
 
 def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> Predictor:

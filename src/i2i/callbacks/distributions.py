@@ -17,6 +17,7 @@ from i2i.data.info import DataInfo
 from i2i.geometry.icosahedron import nearest_element
 from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.models.prediction import PosePrediction
+from i2i.viz.inputs import input_pictures
 from i2i.viz.so3 import PoseSample, RotationDistribution, so3_figure
 from i2i.viz.sphere import MapAxis
 from i2i.viz.style import save_figure
@@ -127,7 +128,7 @@ class DistributionImages(Callback):
         prediction = outputs.get("prediction")
         if not isinstance(prediction, PosePrediction) or prediction.log_prob is None:
             return
-        chosen = picks(batch_idx, sum(batches), size=len(batch["image"]), count=self.max_images)
+        chosen = picks(batch_idx, sum(batches), size=len(batch["class_id"]), count=self.max_images)
         try:
             for index in chosen:
                 self._samples.append(self._sample(pl_module, prediction, batch, index))
@@ -159,7 +160,9 @@ class DistributionImages(Callback):
         angle = float(torch.rad2deg(symmetric_angle_rad(predicted, true, symmetry)))
         return PoseSample(
             distribution,
-            image=batch["image"][index].detach().float().cpu(),
+            image=input_pictures({name: value[index : index + 1] for name, value in batch.items()})[
+                0
+            ],
             true=true,
             predicted=predicted,
             symmetry=symmetry,

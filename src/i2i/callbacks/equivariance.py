@@ -63,7 +63,7 @@ class EquivarianceCurve(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep the first images; a batch that is smaller than `max_images` is enough."""
-        if batch_idx == 0 and dataloader_idx == 0 and trainer.is_global_zero:
+        if batch_idx == 0 and dataloader_idx == 0 and trainer.is_global_zero and "image" in batch:
             self._batch = {name: value[: self.max_images] for name, value in batch.items()}
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

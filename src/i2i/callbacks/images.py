@@ -18,6 +18,7 @@ from i2i.geometry.rotations import geodesic_angle_rad
 from i2i.models.prediction import PosePrediction
 from i2i.rendering.mesh import RenderMesh
 from i2i.viz.grids import class_grid, prediction_grid
+from i2i.viz.inputs import input_pictures
 from i2i.viz.rerender import rerender_each
 
 log = logging.getLogger(__name__)
@@ -73,19 +74,19 @@ class PredictionImages(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep the first images and what was predicted for them."""
-        kept = sum(len(part["image"]) for part in self._parts)
+        kept = sum(len(part["class_id"]) for part in self._parts)
         if kept >= self.max_images or dataloader_idx > 0 or not self._is_due(trainer):
             return
         if not isinstance(outputs, Mapping) or "prediction" not in outputs:
             self._warn("the validation step returned no 'prediction'")
             return
-        prediction, part = outputs["prediction"], {"image": batch["image"]}
-        part["class_id"] = batch["class_id"]
+        prediction, room = outputs["prediction"], self.max_images - kept
+        first = {name: value[:room] for name, value in batch.items()}
+        part = {"image": torch.from_numpy(input_pictures(first)), "class_id": batch["class_id"]}
         if isinstance(prediction, PosePrediction):
             part |= {"predicted": prediction.rotation, "true": batch["rotation"]}
         else:
             part["predicted_class"] = prediction.logits.argmax(dim=1)
-        room = self.max_images - kept
         self._parts.append({name: v[:room].detach().cpu() for name, v in part.items()})
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from i2i.data.info import DataInfo
 from i2i.geometry.cameras import Camera
-from i2i.rendering.base import get_renderer
+from i2i.rendering.base import CHANNELS, MODALITIES, get_renderer
 from i2i.rendering.mesh import RenderMesh
 from i2i.viz.style import ImageArray, to_numpy
 
@@ -35,7 +35,8 @@ def rerender(
     """
     turns = to_numpy(rotations).astype(np.float64).reshape(-1, 3, 3)
     size = info.image_size if image_size is None else image_size
-    blank = np.full((len(turns), info.channels, size, size), info.background, dtype=np.float32)
+    modality = drawn_modality(info)
+    blank = np.full((len(turns), CHANNELS[modality], size, size), info.background, np.float32)
     # A diverged network predicts what no renderer can draw: such a picture stays blank.
     drawable = np.isfinite(turns).all(axis=(1, 2))
     if mesh is None or not drawable.any():
@@ -45,7 +46,7 @@ def rerender(
         _nearest_rotations(turns[drawable]),
         camera=Camera(distance=info.camera_distance, fov_deg=info.camera_fov_deg),
         image_size=size,
-        modality=info.modality,
+        modality=modality,
     )
     blank[drawable] = pixels.astype(np.float32) / 255.0
     return blank
@@ -71,12 +72,18 @@ def rerender_each(
     for index, mesh in enumerate(meshes):
         groups.setdefault(id(mesh), []).append(index)  # one scene is built for each mesh
     size = info.image_size if image_size is None else image_size
-    pictures = np.empty((len(turns), info.channels, size, size), dtype=np.float32)
+    shape = (len(turns), CHANNELS[drawn_modality(info)], size, size)
+    pictures = np.empty(shape, dtype=np.float32)
     for members in groups.values():
         pictures[members] = rerender(
             meshes[members[0]], turns[members], info=info, image_size=size, renderer=renderer
         )
     return pictures
+
+
+def drawn_modality(info: DataInfo) -> str:
+    """Modality of the pictures of a mesh: the network's own, or gray where it sees no image."""
+    return info.modality if info.modality in MODALITIES else "gray"
 
 
 def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:

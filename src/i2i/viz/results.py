@@ -14,8 +14,9 @@ from i2i.rendering.mesh import RenderMesh
 from i2i.viz.classes import confusion_figure
 from i2i.viz.errors import error_figure
 from i2i.viz.grids import class_grid, prediction_grid
+from i2i.viz.inputs import input_pictures
 from i2i.viz.rerender import rerender_each
-from i2i.viz.style import CYCLE, to_numpy
+from i2i.viz.style import CYCLE
 
 _SHOWN = 8
 
@@ -122,7 +123,7 @@ def _classes(
 def test_images(
     arrays: Mapping[str, np.ndarray], chosen: np.ndarray, datamodule: TestedData
 ) -> np.ndarray:
-    """The test images of some predictions as the network saw them, (N, C, S, S) in [0, 1].
+    """What the network saw for some test predictions, as pictures (N, C, S, S) in [0, 1].
 
     Args:
         arrays: With the ``instance_id`` and ``view_id`` of each prediction.
@@ -149,4 +150,4 @@ def test_images(
             "those of the test; use the same data settings and root."
         )
     # Not the stored images: robustness runs shift theirs.
-    return to_numpy(dataset.__getitems__([place[key] for key in keys])["image"])
+    return input_pictures(dataset.__getitems__([place[key] for key in keys]))
