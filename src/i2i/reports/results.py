@@ -168,7 +168,7 @@ def read_results(
     Returns:
         The results in the order of their paths, and a line for each file that could not be read.
     """
-    paths = [path for folder in results for path in sorted(Path(folder).rglob("*.json"))]
+    paths = [path for folder in results for path in sorted(Path(folder).glob("*.json"))]
     if runs is not None:
         paths += sorted(Path(runs).rglob("result.json"))
     best: dict[str, Result] = {}
