@@ -4,6 +4,7 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,3 +40,21 @@ def door(tmp_path_factory):
         return done
 
     return run
+
+
+@pytest.fixture(scope="session")
+def pyrender():
+    """The one OpenGL context of this process: a second one, when closed, would end the first."""
+    import trimesh
+
+    from i2i.errors import RendererUnavailableError
+    from i2i.rendering import get_renderer, prepare_mesh
+
+    try:
+        renderer = get_renderer("pyrender")
+        sphere = prepare_mesh(trimesh.creation.icosphere(subdivisions=1))
+        renderer.render(sphere, np.eye(3)[None], image_size=16)
+    except RendererUnavailableError as error:
+        pytest.skip(str(error))
+    yield renderer
+    renderer.close()

@@ -52,7 +52,7 @@ def test_a_task_that_the_model_cannot_do_is_refused_with_what_it_can():
 
 
 def test_a_modality_that_the_model_does_not_see_is_refused():
-    config = compose([*TINY, "model.modalities=[depth]"])
+    config = compose([*TINY, "model.modalities=[depth]", "data.modality=gray"])
     with pytest.raises(ConfigurationError, match=r"data\.modality=depth"):
         build_datamodule(config)
 

@@ -19,6 +19,8 @@ CAMERA = Camera()
 
 @pytest.fixture(params=["embree", "pyrender", "blender"], scope="module")
 def renderer(request):
+    if request.param == "pyrender":
+        return request.getfixturevalue("pyrender")
     try:
         renderer = get_renderer(request.param)
         sphere = prepare_mesh(trimesh.creation.icosphere(subdivisions=1))

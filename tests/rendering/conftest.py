@@ -6,12 +6,10 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from i2i.errors import RendererUnavailableError
 from i2i.rendering import RenderMesh, get_renderer, prepare_mesh
 
 FURNITURE = Path("/usr/share/sweethome3d/furniture")
@@ -32,18 +30,6 @@ REAL_MODELS = (
 @pytest.fixture(scope="session")
 def embree():
     return get_renderer("embree")
-
-
-@pytest.fixture(scope="session")
-def pyrender():
-    try:
-        renderer = get_renderer("pyrender")
-        sphere = prepare_mesh(trimesh.creation.icosphere(subdivisions=1))
-        renderer.render(sphere, np.eye(3)[None], image_size=16)
-    except RendererUnavailableError as error:
-        pytest.skip(str(error))
-    yield renderer
-    renderer.close()
 
 
 @pytest.fixture(params=["embree", "pyrender"])

@@ -103,6 +103,18 @@ def test_every_model_of_the_tables_sees_its_images_and_does_its_task():
         assert models[name].networks[task], name
 
 
+def test_a_value_that_some_grids_list_goes_to_these_alone():
+    grids = [{"input": "gray", "model": ["i2i", "cnn"]}, {"input": "points", "model": ["epn"]}]
+    assert choices(expand(grids, ["model=cnn,epn"])) == [
+        {"input": "gray", "model": "cnn"},
+        {"input": "points", "model": "epn"},
+    ]
+    assert choices(expand(grids, ["input=points"])) == [{"input": "points", "model": "epn"}]
+    # What no grid lists goes to all of them.
+    assert len(expand(grids, ["model=theirs"])) == 2
+    assert len(expand(grids, ["input=rgb"])) == 3
+
+
 def test_the_scale_that_is_typed_counts_for_the_papers_sources_too():
     job = expand(load_experiment("table1"), ["scale=small", "seed=0"])[0]
     assert plain(compose(job.overrides))["scale"]["name"] == "small"

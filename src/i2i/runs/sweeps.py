@@ -46,6 +46,12 @@ class _Typed:
     name: str
     values: tuple[tuple[str, Any], ...]
 
+    def meant_for(self, grid: Mapping[str, Any], grids: Sequence[Mapping[str, Any]]) -> "_Typed":
+        """Without the values that other grids list and this one does not."""
+        own, anywhere = _listed(self.name, [grid]), _listed(self.name, grids)
+        values = [(w, v) for w, v in self.values if v in own or v not in anywhere]
+        return _Typed(self.name, tuple(values))
+
     def choices(self, followers: Sequence[str] = ()) -> list[_Choice]:
         """One choice a value; tied settings get the same value."""
         return [
@@ -95,7 +101,8 @@ def expand(
         grids: Each a dict of key → value or list of values; see the top of this file.
         overrides: Words of the command line. A key that grids give is replaced where they give it
             (with the settings tied to it); any other goes to every job. Each may have several
-            values: `seed=0,1`.
+            values: `seed=0,1`. A value that some of the grids list goes to these alone:
+            `data.modality=gray` leaves the grids of clouds out.
         config_loader: Hydra's, for words such as `model=glob(i2i*)`.
 
     Raises:
@@ -107,12 +114,23 @@ def expand(
     common = [t.choices() for name, t in typed.items() if name not in listed]
     jobs: dict[frozenset[str], Job] = {}
     for grid in grids or [{}]:
-        factors = [f for key, value in grid.items() for f in _factors(key, value, typed)] + common
+        mine = {t.name: t.meant_for(grid, grids) for t in typed.values()}
+        factors = [f for key, value in grid.items() for f in _factors(key, value, mine)] + common
         for combination in itertools.product(*factors):
             words = tuple(word for choice, _ in combination for word in choice)
             settings = {key: v for _, choice in combination for key, v in choice.items()}
             jobs.setdefault(frozenset(words), Job(words, settings))
     return list(jobs.values())
+
+
+def _listed(name: str, grids: Sequence[Mapping[str, Any]]) -> list[Any]:
+    """All values that some grids give a setting."""
+    found: list[Any] = []
+    for grid in grids:
+        for key, value in grid.items():
+            if name in key.split(","):
+                found += value if isinstance(value, list | tuple) else [value]
+    return found
 
 
 def _factors(key: str, value: object, typed: dict[str, _Typed]) -> list[list[_Choice]]:
