@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 
 from i2i.configuration import compose, config_dir
 from i2i.errors import ConfigurationError
+from i2i.reports.build import build_report
+from i2i.reports.markdown import markdown
+from i2i.reports.paper import load_paper
+from i2i.reports.results import read_results
 from i2i.train import refuse_table, train
 
 TINY = (
@@ -93,6 +98,20 @@ def test_the_broken_job_ends_as_if_it_had_run_through(workplace, broken, monkeyp
     )
     for key in ("config_hash", "errors_deg", "metrics", "steps"):
         assert one[key] == other[key], key
+    assert report_with(workplace, continued.name) == report_with(workplace, "whole")
+
+
+def report_with(workplace, run):
+    """The table of the sweep's results, with that of seed 1 from a certain run."""
+    folder = workplace / f"results_with_{run}"
+    folder.mkdir()
+    for path in results(workplace):
+        if json.loads(path.read_text())["job"]["seed"] != 1:
+            shutil.copy(path, folder)
+    shutil.copy(workplace / "runs" / run / "result.json", folder)
+    found, problems = read_results([folder], None)
+    assert len(found) == 3
+    return markdown(build_report(1, found, load_paper(), problems=problems))
 
 
 def test_a_failing_job_stops_no_other_and_is_told_at_the_end(door, workplace, broken):
