@@ -10,14 +10,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from i2i.cli import door
 from i2i.configuration import register_resolvers
-from i2i.data.point_files import SUFFIXES
+from i2i.data.point_files import SUFFIXES as CLOUDS
 from i2i.errors import ImageError
 from i2i.prediction_results import PoseResult
 from i2i.predictor import load
 from i2i.runs.loading import locate
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
-CLOUDS = SUFFIXES
 
 
 def predict(cfg: DictConfig) -> dict[str, Any]:

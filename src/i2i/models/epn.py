@@ -108,14 +108,7 @@ class EPNPose(nn.Module):
             logits = SHARPNESS * self.score(features)[..., 0]
         residual = self.residual(features).mT
         candidates = candidate_rotations(residual, self.elements, "view")
-        best = logits.argmax(dim=1)
-        return PosePrediction(
-            rotation=candidates[torch.arange(len(best), device=best.device), best],
-            logits=logits,
-            log_prob=torch.log_softmax(logits, dim=1),
-            candidates=candidates,
-            extras={"residual": residual},
-        )
+        return PosePrediction.of_candidates(logits, candidates, residual=residual)
 
     def group_target(self, batch: Batch) -> GroupTarget:
         """The label of each sample: nearest element, angles and residuals of the view."""

@@ -172,14 +172,7 @@ class I2IPose(nn.Module):
         index = batch.get("class_id") if self.num_classes > 1 else None
         logits, residual = split_group_output(self.trunk(batch["image"], index))
         candidates = candidate_rotations(residual, self.elements, self.target)
-        best = logits.argmax(dim=1)
-        return PosePrediction(
-            rotation=candidates[torch.arange(len(best), device=best.device), best],
-            logits=logits,
-            log_prob=torch.log_softmax(logits, dim=1),
-            candidates=candidates,
-            extras={"residual": residual},
-        )
+        return PosePrediction.of_candidates(logits, candidates, residual=residual)
 
     def group_target(self, batch: Batch) -> GroupTarget:
         """The label of each sample: nearest element, angles and residuals of the `rotation`."""

@@ -39,6 +39,20 @@ class PosePrediction:
     equal_volume: bool = False
     concentration: Tensor | None = None
 
+    @classmethod
+    def of_candidates(
+        cls, logits: Tensor, candidates: Tensor, **extras: Tensor
+    ) -> "PosePrediction":
+        """The best of candidates (B, K, 3, 3) by their logits (B, K), with their softmax."""
+        best = logits.argmax(dim=1)
+        return cls(
+            rotation=candidates[torch.arange(len(best), device=best.device), best],
+            logits=logits,
+            log_prob=torch.log_softmax(logits, dim=1),
+            candidates=candidates,
+            extras=extras,
+        )
+
     def components(self) -> tuple[Tensor, Tensor]:
         """Log masses (B, K) and centres (B, K, 3, 3) or (K, 3, 3); one component at a point."""
         if self.log_prob is None or self.candidates is None:

@@ -10,6 +10,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from i2i.configuration import compose, plain
+from i2i.data.info import CLOUDS
 
 # Where things lie, how they are shown, and on what they run: not part of what a job computes.
 _LEFT_OUT_OF_DATA = (
@@ -62,7 +63,7 @@ def identity_config(config: dict[str, Any]) -> dict[str, Any]:
 
 def _settings_of_others(modality: str) -> tuple[str, ...]:
     """Settings that say nothing about data of this modality."""
-    if modality not in ("partial_points", "full_points"):
+    if modality not in CLOUDS:
         return _OF_CLOUDS
     return (*_OF_IMAGES, *(() if modality == "partial_points" else ("cloud_image_size",)))
 
