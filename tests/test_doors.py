@@ -17,6 +17,7 @@ TINY = (
     "scale=tiny", "data.source.instances_per_class=6", "data.source.test_instances_per_class=3",
     "data.views_per_instance=8", "data.test_views_per_instance=4", "trainer.accelerator=cpu",
 )  # fmt: skip
+NO_PICTURES = "callbacks=no_pictures"
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +27,9 @@ def workplace(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(door, workplace):
+def trained(fresh_door, workplace):
     """The folder of a run that went through."""
-    done = door("train", *TINY, "run_name=whole", cwd=workplace)
+    done = fresh_door("train", *TINY, "run_name=whole", cwd=workplace)
     return workplace / "runs" / "whole", done.stdout
 
 
@@ -131,7 +132,7 @@ def _train_process(workplace, *words):
 
 
 def test_a_run_killed_in_the_middle_goes_on_to_the_same_result(door, workplace):
-    longer = ("trainer.max_steps=60", "data.num_workers=0")
+    longer = (NO_PICTURES, "trainer.max_steps=60", "data.num_workers=0")
     whole = door("train", *TINY, *longer, "run_name=unbroken", cwd=workplace).stdout
     process = _train_process(workplace, *longer, "run_name=broken")
     last = workplace / "runs" / "broken" / "checkpoints" / "last.ckpt"
@@ -164,14 +165,19 @@ def test_resume_refuses_words_that_would_change_the_result(door, workplace, trai
     assert "Traceback" not in done.stderr
 
 
-def test_two_processes_train_and_test_every_image_once(door, workplace):
-    door("train", *TINY, "trainer.devices=2", "trainer.strategy=ddp", "run_name=ddp", cwd=workplace)
+def test_two_processes_train_and_test_every_image_once(fresh_door, workplace):
+    fresh_door(
+        "train", *TINY, NO_PICTURES, "trainer.devices=2", "trainer.strategy=ddp", "run_name=ddp",
+        cwd=workplace,
+    )  # fmt: skip
     arrays = np.load(workplace / "runs" / "ddp" / "predictions.npz")
     pairs = set(zip(arrays["instance_id"].tolist(), arrays["view_id"].tolist(), strict=True))
     assert len(arrays["error_deg"]) == len(pairs) == 12
 
 
-def test_an_encoder_from_another_package_trains_without_a_change_here(door, workplace, monkeypatch):
+def test_an_encoder_from_another_package_trains_without_a_change_here(
+    fresh_door, workplace, monkeypatch
+):
     package = workplace / "their_package"
     (package / "theirs" / "conf" / "model" / "encoder").mkdir(parents=True)
     (package / "theirs" / "__init__.py").write_text("")
@@ -192,8 +198,8 @@ def test_an_encoder_from_another_package_trains_without_a_change_here(door, work
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
     )
-    door(
-        "train", *TINY, "model/encoder=patches", "hydra.searchpath=[pkg://theirs.conf]",
+    fresh_door(
+        "train", *TINY, NO_PICTURES, "model/encoder=patches", "hydra.searchpath=[pkg://theirs.conf]",
         "run_name=theirs", cwd=workplace,
     )  # fmt: skip
     checkpoint = torch.load(workplace / "runs/theirs/checkpoints/last.ckpt", weights_only=True)
@@ -209,7 +215,7 @@ def test_one_mesh_file_is_rendered_learned_and_recognised_by_three_commands(door
            "data.test_views_per_instance=8")  # fmt: skip
     rendered = door("render", *own, cwd=workplace).stdout
     assert "store" in rendered
-    door("train", *own, "run_name=bracket", "trainer.accelerator=cpu", cwd=workplace)
+    door("train", *own, NO_PICTURES, "run_name=bracket", "trainer.accelerator=cpu", cwd=workplace)
     from PIL import Image
 
     store = next((workplace / "data" / "renders").rglob("bracket/test/images.npy"))
@@ -228,8 +234,8 @@ def test_debug_configurations_run(door, workplace, debug):
 
 def test_classification_trains_from_the_command_line(door, workplace):
     done = door(
-        "train", *TINY, "task=classification", "data.object=[chair,car]", "run_name=classes",
-        cwd=workplace,
+        "train", *TINY, NO_PICTURES, "task=classification", "data.object=[chair,car]",
+        "run_name=classes", cwd=workplace,
     )  # fmt: skip
     metrics = json.loads((workplace / "runs/classes/metrics.json").read_text())["metrics"]
     arrays = np.load(workplace / "runs" / "classes" / "predictions.npz")
@@ -240,7 +246,7 @@ def test_classification_trains_from_the_command_line(door, workplace):
 
 
 def test_one_network_learns_the_poses_of_two_classes(door, workplace):
-    door("train", *TINY, "data.object=[chair,car]", "run_name=joint", cwd=workplace)
+    door("train", *TINY, NO_PICTURES, "data.object=[chair,car]", "run_name=joint", cwd=workplace)
     metrics = json.loads((workplace / "runs/joint/metrics.json").read_text())["metrics"]
     mean = (metrics["chair/median_error_deg"] + metrics["car/median_error_deg"]) / 2
     assert metrics["mean_class_median_error_deg"] == pytest.approx(mean)
@@ -259,7 +265,7 @@ def test_the_papers_row_trains_once_the_meshes_are_there(door, workplace, layout
     door(
         "train", "model=i2i", "task=pose", f"data={layout}_chair", f"data.root={layout}",
         "scale=tiny", "data.views_per_instance=8", "data.test_views_per_instance=4",
-        f"run_name={layout}", "trainer.accelerator=cpu", cwd=workplace,
+        f"run_name={layout}", "trainer.accelerator=cpu", NO_PICTURES, cwd=workplace,
     )  # fmt: skip
     result = json.loads((workplace / "runs" / layout / "result.json").read_text())
     assert result["job"]["modality"] == ("rgb" if layout == "shapenet" else "gray")
@@ -283,7 +289,7 @@ def test_pictures_with_labels_are_a_data_set(door, workplace, trained):
     (folder / "labels.csv").write_text("\n".join(rows))
     door(
         "train", "data=images", "data.root=pictures", "data.modality=gray", "scale=tiny",
-        "run_name=pictures", "trainer.accelerator=cpu", cwd=workplace,
+        "run_name=pictures", "trainer.accelerator=cpu", NO_PICTURES, cwd=workplace,
     )  # fmt: skip
     arrays = np.load(workplace / "runs" / "pictures" / "predictions.npz")
     np.testing.assert_allclose(arrays["rotation_true"], rotations[32:40], atol=1e-5)

@@ -26,9 +26,7 @@ TINY = (
     "scale=tiny", "data.source.instances_per_class=6", "data.source.test_instances_per_class=3",
     "data.views_per_instance=8", "data.test_views_per_instance=4", "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false", "trainer.enable_model_summary=false", "data=synthetic",
-    # Pictures are most of the work of so small a job.
-    "callbacks.images=null", "callbacks.histogram=null", "callbacks.distributions=null",
-    "callbacks.equivariance=null",
+    "callbacks=no_pictures",
 )  # fmt: skip
 # One model of a table: the table's own values of these keys are replaced.
 SWEEP = ("-m", "experiment=table1", *TINY, "model=i2i", "data.object=chair", "seed=0,1,2")

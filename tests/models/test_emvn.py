@@ -93,20 +93,6 @@ def test_one_step_changes_every_parameter_but_the_idle_biases(views):
         assert (change < 1e-6) if name in idle else (change > 0), name
 
 
-@pytest.mark.parametrize("pooling", ["max", "mean"])
-def test_overfits_eight_objects(pooling):
-    network, batch = make(pooling=pooling), make_batch()
-    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
-    for _ in range(80):
-        optimiser.zero_grad()
-        prediction = network(batch)
-        network.loss(prediction, batch)["classification"].backward()
-        optimiser.step()
-        if torch.equal(prediction.logits.argmax(dim=1), batch["class_id"]):
-            return
-    raise AssertionError("not learned in 80 steps")
-
-
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("size", [32, 64])
 def test_batch_of_one_and_determinism(size, channels):

@@ -63,21 +63,6 @@ def test_parameters_at_the_sizes_of_the_paper(options, expected):
     assert count(network) == expected
 
 
-@pytest.mark.parametrize("scale", ["small", "tiny"])
-def test_as_large_as_i2i_at_every_scale(scale):
-    sizes = {}
-    for model in ("i2i", "i2sphere"):
-        config = compose([f"model={model}", f"scale={scale}", "data=synthetic"])
-        network = instantiate(
-            config.model.networks.pose,
-            channels=1,
-            num_classes=1,
-            image_size=config.scale.image_size,
-        )
-        sizes[model] = count(network)
-    assert sizes["i2sphere"] / sizes["i2i"] == pytest.approx(1, abs=0.02)
-
-
 @pytest.mark.parametrize("options", [{}, {"loss": "wigner_mse"}, {"so3_features": 3}])
 @pytest.mark.parametrize("modality", ["gray", "rgb"])
 def test_configurations_train(options, modality):

@@ -83,19 +83,6 @@ def test_one_step_changes_every_parameter(task, classes):
 
 
 @every
-def test_overfits_sixteen_clouds(task):
-    network, batch = make(task), make_batch(16)
-    train(network, batch, 25 if task == "classification" else 60)
-    with torch.no_grad():
-        prediction = network(batch)
-    if task == "classification":
-        assert torch.equal(prediction.logits.argmax(dim=1), batch["class_id"])
-    else:
-        error = torch.rad2deg(geodesic_angle_rad(prediction.rotation, batch["rotation"]))
-        assert error.median() < 15
-
-
-@every
 def test_batch_of_one_and_determinism(task):
     network, batch = make(task), make_batch(4)
     alone = {key: value[:1] for key, value in batch.items()}

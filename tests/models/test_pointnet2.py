@@ -86,18 +86,6 @@ def test_one_step_changes_every_parameter_but_biases_that_a_norm_takes_away():
     assert same <= idle
 
 
-def test_overfits_sixteen_clouds():
-    network, batch = make(dropout=0.0, random_start=False), make_batch(16)
-    optimiser = torch.optim.Adam(network.parameters(), lr=5e-3)
-    for _ in range(40):
-        optimiser.zero_grad()
-        network.loss(network(batch), batch)["classification"].backward()
-        optimiser.step()
-    with torch.no_grad():
-        prediction = network(batch)
-    assert torch.equal(prediction.logits.argmax(dim=1), batch["class_id"])
-
-
 @pytest.mark.parametrize("nearest", [False, True])
 def test_batch_of_one_and_determinism(nearest):
     network, batch = make(nearest=nearest), make_batch(4)
