@@ -1,4 +1,4 @@
-"""Peak resident memory of training, in a fresh process, and the time of a step.
+"""Peak resident memory of training, and the times of a step and of its batch of data.
 
 python benchmarks/training_memory.py                  # i2i, scale=paper, batch 64, fp32
 python benchmarks/training_memory.py scale=small trainer.precision=bf16-mixed
@@ -8,84 +8,112 @@ python benchmarks/training_memory.py --clouds-and-views   # those of tables 1 an
 import multiprocessing
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from statistics import median
 
 import torch
-from rich.console import Console
-from rich.table import Table
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 
 from i2i.configuration import compose
-from i2i.data.noise import noise_batch
-from i2i.runs.building import build_network, info_of
+from i2i.runs.building import build_datamodule, build_network
 
-STEPS = 4
+STEPS = 3
+OBJECTS = 26  # at least a batch of them where a pass shows each once
 CLOUDS_AND_VIEWS = (
-    ("kpconv", "pose"),
-    ("kpconv_rigid", "pose"),
-    ("epn", "pose"),
-    ("pointnet2", "classification"),
-    ("kpconv", "classification"),
-    ("epn", "classification"),
-    ("rotationnet_20", "classification"),
-    ("emvn_12", "classification"),
+    "model=kpconv task=pose",
+    "model=kpconv_rigid task=pose",
+    "model=epn task=pose",
+    "model=pointnet2 task=classification",
+    "model=kpconv task=classification",
+    "model=epn task=classification",
+    "model=emvn_12 task=classification",
+    "model=emvn_60 task=classification",
+    "model=rotationnet_20 task=classification",
+    "model=rotationnet_20 model/trunk=alexnet task=classification",
 )
+COLUMNS = "| model | scale | a sample | batch | parameters | peak, GiB | s a step | ms its data |"
 
 
-def measure(words: Sequence[str]) -> dict[str, float | int | str]:
-    """Train a network of noise for a few steps; call it in a process of its own."""
-    config = compose(words)
-    batch = config.data.batch_size
+def configuration(words: Sequence[str], store_root: str) -> DictConfig:
+    """Training on a few made chairs, or chairs and tables."""
+    pose = compose(words).task.name == "pose"
+    few = [
+        "data=synthetic", f"data.store_root={store_root}",
+        f"data.object={'chair' if pose else '[chair,table]'}",
+        f"data.source.instances_per_class={OBJECTS if pose else OBJECTS // 2}",
+        "data.source.test_instances_per_class=1", "data.test_views_per_instance=1",
+    ]  # fmt: skip
+    return compose([*few, *words])
+
+
+def measure(words: Sequence[str], store_root: str) -> str:
+    """A row of the table; called in a process of its own, as the peak of one never falls."""
+    config = configuration(words, store_root)
+    data = build_datamodule(config)
+    data.prepare_data()
+    data.setup("fit")
     classes = 1 if config.task.name == "pose" else 40
-    info = info_of(config, tuple(f"class {i}" for i in range(classes)))
+    info = replace(
+        data.info,
+        class_names=tuple(f"class {i}" for i in range(classes)),
+        symmetry=("none",) * classes,
+    )
     network = build_network(config, info)
-    optimizer = torch.optim.SGD(network.parameters(), 1e-3, momentum=0.9, nesterov=True)
-    data = noise_batch(info, batch)
-    seconds = []
+    optimizer = instantiate(config.task.optimizer)(network.parameters())
+    low = "bf16" in str(config.trainer.precision)
+    batches, waits, steps = iter(data.train_dataloader()), [], []
     for _ in range(STEPS):
         start = time.perf_counter()
-        low = "bf16" in str(config.trainer.precision)
+        try:
+            batch = next(batches)
+        except StopIteration:  # the few objects are over
+            batches = iter(data.train_dataloader())
+            batch = next(batches)
+        loaded = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16, enabled=low):
-            loss = sum(network.loss(network(data), data).values())
+            loss = sum(network.loss(network(batch), batch).values())
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-        seconds.append(time.perf_counter() - start)
-    return {
-        "model": f"{config.model.name}, {config.task.name}",
-        "scale": config.scale.name,
-        "input": f"{info.num_points} points" if info.num_points else f"{info.image_size} px",
-        "batch": batch,
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        "step_s": sorted(seconds)[STEPS // 2],
-    }
+        waits.append(loaded - start)
+        steps.append(time.perf_counter() - loaded)
+    shown = f"{info.num_points} points" if info.num_points else f"{info.image_size} px"
+    if info.num_views:
+        shown = f"{info.num_views} × {shown}"
+    count = sum(p.numel() for p in network.parameters())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return (
+        f"| {' '.join(words)} | {config.scale.name} | {shown} | {len(batch['class_id'])} | "
+        f"{count:,} | {peak:.2f} | {median(steps):.2f} | {1000 * median(waits):.0f} |"
+    )
 
 
 def main() -> None:
-    words = sys.argv[1:]
-    jobs = [["scale=paper", *words]]
-    if "--clouds-and-views" in words:
-        others = [word for word in words if not word.startswith("--")]
+    words = [word for word in sys.argv[1:] if not word.startswith("--")]
+    jobs = [words if any(w.startswith("scale=") for w in words) else ["scale=paper", *words]]
+    if "--clouds-and-views" in sys.argv:
         jobs = [
-            [f"model={model}", f"task={task}", f"scale={scale}", *others]
+            [*job.split(), f"scale={scale}", *words]
             for scale in ("small", "paper")
-            for model, task in CLOUDS_AND_VIEWS
+            for job in CLOUDS_AND_VIEWS
         ]
-    table = Table(
-        "model", "scale", "input", "batch", "parameters", "peak, GiB", "s a step", "steps/s"
-    )
+    print(COLUMNS, "|---" * COLUMNS.count(" | ") + "|---|", sep="\n", flush=True)
     for job in jobs:
-        # A process of its own for each: the peak of a process never falls.
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            row = pool.apply(measure, (job,))
-        table.add_row(
-            *(str(row[key]) for key in ("model", "scale", "input", "batch")),
-            f"{row['parameters']:,}", f"{row['peak_gib']:.2f}", f"{row['step_s']:.2f}",
-            f"{1 / float(row['step_s']):.2f}",
-        )  # fmt: skip
-    Console(width=110).print(table)
-    print(f"{torch.get_num_threads()} threads, {STEPS} steps each, the upper middle time")
+        with tempfile.TemporaryDirectory() as store_root:
+            build_datamodule(configuration(job, store_root)).prepare_data()
+            context = multiprocessing.get_context("spawn")
+            try:
+                with ProcessPoolExecutor(1, mp_context=context) as pool:
+                    print(pool.submit(measure, job, store_root).result(), flush=True)
+            except BrokenProcessPool:
+                print(f"| {' '.join(job)} | ended by the system: too little memory |", flush=True)
+    print(f"{torch.get_num_threads()} threads; medians of {STEPS} steps on made objects")
 
 
 if __name__ == "__main__":

@@ -6,13 +6,15 @@ import json
 import numpy as np
 import pytest
 import torch
+from hydra.errors import HydraException
 from omegaconf import open_dict
 
 from i2i.configuration import compose
 from i2i.data.info import DataInfo
 from i2i.errors import CheckpointError, ConfigurationError, NonFiniteLossError
 from i2i.evaluate import evaluate
-from i2i.runs.building import build_datamodule, build_network, build_task, check_fit
+from i2i.predictor import Predictor
+from i2i.runs.building import build_datamodule, build_network, build_task, check_fit, info_of
 from i2i.runs.loading import load_task, load_weights, locate, read_checkpoint
 from i2i.train import train
 
@@ -49,6 +51,26 @@ def test_a_task_that_the_model_cannot_do_is_refused_with_what_it_can():
     config = compose([*TINY, "~model.networks.classification", "task=classification"])
     with pytest.raises(ConfigurationError, match="task=pose"):
         check_fit(config)
+
+
+def test_axes_of_clouds_are_refused_with_a_picture():
+    config = compose(TINY)
+    predictor = Predictor(build_network(config, info(1)), info(1))
+    with pytest.raises(ConfigurationError, match="axes=opencv is for clouds"):
+        predictor.predict(np.zeros((32, 32), np.uint8), axes="opencv")
+
+
+@pytest.mark.parametrize("model", ["epn", "kpconv"])
+def test_clouds_too_small_for_the_network_are_refused_before_training(model):
+    config = compose([*TINY, f"model={model}", "data.num_points=16"])
+    with pytest.raises(HydraException, match=r"data\.num_points=16: this network needs 32"):
+        build_network(config, info_of(config, ("chair",)))
+
+
+def test_log_polar_views_want_a_trunk_with_circular_rows():
+    config = compose([*TINY, "task=classification", "model=emvn_12", "model/trunk=alexnet"])
+    with pytest.raises(HydraException, match=r"set model\.log_polar=false or model/trunk=resnet18"):
+        build_network(config, info_of(config, ("chair", "car")))
 
 
 def test_a_modality_that_the_model_does_not_see_is_refused():

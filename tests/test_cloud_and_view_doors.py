@@ -79,6 +79,9 @@ def test_what_is_made_for_images_refuses_clouds_with_what_to_give(pose_run, door
     masked = door("predict", f"run={pose_run}", "input=part.ply", "mask=part.ply",
                   cwd=workplace, check=False)  # fmt: skip
     assert "mask= is for pictures" in masked.stderr
+    wider = door("predict", f"run={pose_run}", "input=part.ply", "margin=1.2", cwd=workplace,
+                 check=False)  # fmt: skip
+    assert "margin= is for pictures" in wider.stderr
 
 
 def test_a_multi_view_network_trains_and_cannot_answer_for_one_picture(door, workplace):

@@ -87,12 +87,12 @@ def _check_same_data(trained: DataInfo, given: DataInfo) -> None:
     Raises:
         ConfigurationError: naming the field and both values.
     """
-    for field in ("class_names", "channels", "image_size", "modality"):
+    for field in ("class_names", "channels", "image_size", "modality", "num_points", "camera_set"):
         asked, known = getattr(given, field), getattr(trained, field)
         if asked != known:
             raise ConfigurationError(
                 f"the run was trained with {field} {known}, these data have {asked}: leave the "
-                "data's object, modality and size as they were"
+                "data's object, modality and sizes as they were"
             )
 
 

@@ -138,13 +138,20 @@ class Predictor:
 
         Raises:
             ImageError: if the picture cannot be read, or mask, box or intrinsics do not fit it.
-            ConfigurationError: if the class is unknown, or is needed and not given.
+            ConfigurationError: if the class is unknown, or is needed and not given; or if what is
+                meant for pictures was given with a cloud, or the other way round.
             CheckpointError: if the network's answer is not finite.
         """
         if class_name is not None:
             self._check_class(class_name)
         if self.info.num_points is not None:
-            seen = self._see_cloud(image, axes, mask=mask, box=box, intrinsics=intrinsics)
+            crop = {"mask": mask, "box": box, "intrinsics": intrinsics}
+            seen = self._see_cloud(image, axes, **crop, margin=None if margin == 1 else margin)
+        elif axes != "opengl":
+            raise ConfigurationError(
+                f"axes={axes} is for clouds, and this network sees {self.info.modality}: leave it "
+                "out"
+            )
         else:
             seen = self._see_picture(image, mask, box, intrinsics, margin)
         batch = {name: tensor.to(self.device) for name, tensor in seen.batch.items()}

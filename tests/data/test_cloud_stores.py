@@ -171,7 +171,7 @@ def test_an_object_that_cannot_be_seen_is_skipped_and_listed(tmp_path, caplog):
     assert "box/box_01: no pixel" in caplog.text
     card = json.loads((paths["box", "train"] / "card.json").read_text())
     assert [entry["id"] for entry in card["items"]] == ["box_00", "box_02", "box_03", "box_04"]
-    assert "no pixel of the 8 px depth image" in card["skipped"][0]["reason"]
+    assert "no pixels of the 8 px depth image" in card["skipped"][0]["reason"]
     with pytest.raises(MeshError, match=r"box_01.*no pixel"):
         render(tmp_path, "partial_points", renderer=BlindRenderer(), strict=True)
 

@@ -66,12 +66,28 @@ def test_few_points_are_repeated_and_what_was_not_measured_is_left_out(points):
 
 @pytest.mark.parametrize(
     ("content", "word"),
-    [(np.zeros((50, 2)), r"\(N, 3\)"), (np.zeros((50, 3)), "apart"), (np.ones((5, 3)), "at least")],
+    [
+        (np.zeros((50, 2)), r"\(N, 3\)"),
+        (np.zeros((50, 3)), "the same point"),
+        (np.ones((5, 3)), "at least"),
+    ],
 )
 def test_what_is_no_cloud_is_refused(content, word, tmp_path):
     np.save(tmp_path / "bad.npy", content)
     with pytest.raises(ImageError, match=word):
         read_points(tmp_path / "bad.npy")
+
+
+def test_files_of_nothing_and_cut_files_are_named(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
+    (tmp_path / "none.ply").write_text(header)
+    (tmp_path / "empty.npy").touch()
+    np.savez(tmp_path / "cut.npz", points=np.ones((99, 3)))
+    whole = (tmp_path / "cut.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("none.ply", "empty.npy", "cut.npz"):
+        with pytest.raises(ImageError, match=name):
+            read_points(tmp_path / name)
 
 
 def test_files_that_cannot_be_read_are_named_with_what_can(tmp_path):

@@ -84,7 +84,7 @@ def test_few_visible_pixels_repeat_in_the_same_order(chair, rotations):
 
 def test_an_object_that_no_pixel_shows_is_an_error(rotations):
     needle = trimesh.Trimesh([[0, 0, -1], [0, 0, 1], [1e-6, 0, 0]], [[0, 1, 2]])
-    with pytest.raises(MeshError, match=r"no pixel of the 16 px.*data\.cloud_image_size"):
+    with pytest.raises(MeshError, match=r"no pixels of the 16 px.*data\.cloud_image_size"):
         visible_clouds(
             get_renderer("embree"),
             prepare_mesh(needle),
@@ -92,6 +92,15 @@ def test_an_object_that_no_pixel_shows_is_an_error(rotations):
             camera=CAMERA,
             image_size=16,
             num_points=8,
+        )
+
+
+def test_an_object_that_a_handful_of_pixels_shows_is_an_error():
+    rod = prepare_mesh(trimesh.creation.box((0.02, 0.02, 1)))
+    end_on = np.eye(3)[None]
+    with pytest.raises(MeshError, match=r"\d pixels of the 128 px.*data\.cloud_image_size"):
+        visible_clouds(
+            get_renderer("embree"), rod, end_on, camera=CAMERA, image_size=128, num_points=64
         )
 
 

@@ -227,3 +227,28 @@ def test_no_paper_number_ever_stands_in_our_column(read, paper):
         numbers = [re.findall(r",1\d\d\d\.\d", csv_text(report)) for report in (before, after)]
         assert not numbers[0]
         assert numbers[1]
+
+
+@pytest.mark.parametrize("model", ["epn", "kpconv", "kpconv_rigid"])
+def test_clouds_stand_with_the_images_of_the_same_views(read, paper, model):
+    cloud = made(model, modality="partial_points")
+    report = build_report(1, read(made(), cloud), paper)
+    assert len(report.sections) == 1
+    cell = row(report, model, seen="partial_points").ours["chair"]
+    assert cell.value == pytest.approx(np.median(cloud["errors_deg"]))
+
+
+@pytest.mark.parametrize(
+    ("model", "modality"),
+    [("pointnet2", "full_points"), ("epn", "full_points"), ("kpconv", "full_points"),
+     ("rotationnet_20", "views"), ("emvn_12", "views")],
+)  # fmt: skip
+def test_classes_of_clouds_and_views_stand_with_those_of_images(read, paper, model, modality):
+    options = {"task": "classification", "obj": ["chair", "sofa"]}
+    views = 6 if modality == "views" else 1
+    other = made(model, modality=modality, views=views, **options)
+    image = made("i2i", modality="depth", changes=[("data.modality", "depth")], **options)
+    report = build_report(3, read(image, other), paper)
+    assert len(report.sections) == 1
+    cell = row(report, model, seen=modality).ours["accuracy"]
+    assert cell.value == pytest.approx(100 * np.mean(other["correct"]), abs=0.01)

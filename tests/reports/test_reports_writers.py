@@ -35,7 +35,7 @@ def test_markdown_has_the_papers_line_above_ours(report):
     rows = rows_of(markdown(report))
     head, width = rows[0], len(rows[0])
     column = head.index("chair")
-    names = [r[1] for r in rows[: 2 + 2 * 8]]
+    names = [r[1] for r in rows[: 2 + 2 * 9]]
     place = names.index("I2I")
     assert rows[place][2:4] == ["paper", "63.1"]
     assert rows[place][head.index("mean")] == "12.6"
@@ -47,7 +47,7 @@ def test_markdown_has_the_papers_line_above_ours(report):
     )
     assert ours[head.index("desk")] == "–"
     assert ours[head.index("parameters") :] == ["730,951", "2", "8"]
-    assert all(len(row) == width for row in rows[: 2 + 2 * 8])
+    assert all(len(row) == width for row in rows[: 2 + 2 * 9])
     empty = rows[names.index("EPN") + 1]
     assert set(empty[3:]) == {"–"}
 

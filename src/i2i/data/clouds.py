@@ -38,7 +38,8 @@ class CloudAugmentation:
         rotate: Turn each cloud by a uniform rotation Q; its label becomes Q @ rotation.
         dropout: Largest share of dropped points; a cloud's own share is uniform from 0 to it. They
             become copies of the cloud's first point, so their number stays (as in PointNet++).
-        scale: Largest change s of the size: one factor for all axes, uniform in [1 − s, 1 + s].
+        scale: Largest change s of the size: a factor uniform in [1 − s, 1 + s].
+        scale_per_axis: A factor for each axis of the camera instead of one for all.
         shift: Largest shift along each axis, uniform.
         noise: Standard deviation of a normal disturbance of each coordinate.
         seed: Seed of the draws.
@@ -49,6 +50,7 @@ class CloudAugmentation:
     rotate: bool = False
     dropout: float = 0.0
     scale: float = 0.0
+    scale_per_axis: bool = False
     shift: float = 0.0
     noise: float = 0.0
     seed: int = 0
@@ -79,7 +81,8 @@ class CloudAugmentation:
         if self.dropout:
             wide = np.where(self.dropped(wide.shape[1], keys)[..., None], wide[:, :1], wide)
         if self.scale:
-            wide = wide * (1 + self.scale * self._signed(_SCALE, (), keys))[:, None, None]
+            axes = 3 if self.scale_per_axis else 1
+            wide = wide * (1 + self.scale * self._signed(_SCALE, (axes,), keys))[:, None]
         if self.shift:
             wide = wide + self.shift * self._signed(_SHIFT, (3,), keys)[:, None]
         return wide.astype(np.float32), rotation.astype(np.float32)

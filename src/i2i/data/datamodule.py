@@ -70,6 +70,7 @@ class RenderedDataModule(ImageDataModule):
         rotate_points: See `LoaderSettings`, as for all that follow.
         point_dropout: See `LoaderSettings`.
         point_scale: See `LoaderSettings`.
+        point_scale_per_axis: See `LoaderSettings`.
         point_shift: See `LoaderSettings`.
         point_noise: See `LoaderSettings`.
 
@@ -115,6 +116,7 @@ class RenderedDataModule(ImageDataModule):
         rotate_points: bool | None = None,
         point_dropout: float = 0.0,
         point_scale: float = 0.0,
+        point_scale_per_axis: bool | None = None,
         point_shift: float = 0.0,
         point_noise: float = 0.0,
     ) -> None:
@@ -131,6 +133,7 @@ class RenderedDataModule(ImageDataModule):
             rotate_points=rotate_points,
             point_dropout=point_dropout,
             point_scale=point_scale,
+            point_scale_per_axis=point_scale_per_axis,
             point_shift=point_shift,
             point_noise=point_noise,
         )

@@ -38,7 +38,8 @@ class LoaderSettings:
         rotate_points: Turn each training cloud by a fresh random rotation, and its label with it;
             None for full clouds only.
         point_dropout: Training clouds: largest share of dropped points.
-        point_scale: Training clouds: largest change of the size, one factor for all axes.
+        point_scale: Training clouds: largest change of the size.
+        point_scale_per_axis: Draw a factor for each axis of the camera; otherwise one for all.
         point_shift: Training clouds: largest shift along each axis, in radii of the cloud.
         point_noise: Training clouds: standard deviation of each coordinate, in radii of the cloud.
     """
@@ -55,6 +56,7 @@ class LoaderSettings:
     rotate_points: bool | None = None
     point_dropout: float = 0.0
     point_scale: float = 0.0
+    point_scale_per_axis: bool | None = None
     point_shift: float = 0.0
     point_noise: float = 0.0
 
@@ -180,6 +182,7 @@ class ImageDataModule(LightningDataModule):
                 rotate=self.modality == "full_points" if turned is None else turned,
                 dropout=loader.point_dropout,
                 scale=loader.point_scale,
+                scale_per_axis=bool(loader.point_scale_per_axis),
                 shift=loader.point_shift,
                 noise=loader.point_noise,
                 seed=seed,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -41,7 +42,7 @@ def read_points(source: Cloud) -> np.ndarray:
         raise ImageError(
             f"input={name}: no such file; give a cloud, {', '.join(SUFFIXES)}"
         ) from None
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError, IndexError) as error:
         raise ImageError(
             f"input={name} cannot be read as points ({type(error).__name__}: {error}); "
             f"give {', '.join(SUFFIXES)}"
@@ -50,8 +51,10 @@ def read_points(source: Cloud) -> np.ndarray:
         raise ImageError(f"{name} has shape {points.shape}; a cloud is (N, 3), one point a row")
     points = points[:, :3].astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]  # depth cameras mark what they miss with NaN
-    if len(points) < _FEWEST or np.ptp(points, axis=0).max() == 0:
-        raise ImageError(f"{name} has {len(points)} finite points; give at least {_FEWEST} apart")
+    if len(points) < _FEWEST:
+        raise ImageError(f"{name} has {len(points)} finite points; give at least {_FEWEST}")
+    if np.ptp(points, axis=0).max() == 0:
+        raise ImageError(f"all {len(points)} points of {name} are the same point")
     return points
 
 
@@ -96,4 +99,4 @@ def _load(path: Path) -> np.ndarray:
         raise ValueError(f"{suffix or 'no suffix'} is not a cloud's")
     with path.open("rb") as stream:
         loaded: Any = trimesh.load(stream, file_type="ply", process=False)
-    return np.asarray(loaded.vertices)
+    return np.asarray(getattr(loaded, "vertices", np.empty((0, 3))))  # a file without any: a scene

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from i2i.data.content import SMALLEST_CLOUD
 from i2i.errors import MeshError
 from i2i.geometry.cameras import Camera
 from i2i.geometry.seeding import uniform_hash
@@ -50,16 +51,16 @@ def visible_clouds(
         Shape (N, P, 3), float32, in camera axes with the origin at the object's centre.
 
     Raises:
-        MeshError: if no pixel shows the object.
+        MeshError: if hardly a pixel shows the object.
     """
     depth = renderer.depth(mesh, rotations, camera=camera, image_size=image_size)
     clouds = np.empty((len(rotations), num_points, 3), np.float32)
     for cloud, ray_length in zip(clouds, depth, strict=True):
         visible = camera.unproject(ray_length)[ray_length > 0].astype(np.float32)
-        if not len(visible):
+        if len(visible) < SMALLEST_CLOUD:
             raise MeshError(
-                f"no pixel of the {image_size} px depth image shows the mesh: its parts are too "
-                "thin; give a larger data.cloud_image_size"
+                f"{len(visible) or 'no'} pixels of the {image_size} px depth image show the mesh: "
+                "its parts are too thin; give a larger data.cloud_image_size"
             )
         cloud[:] = visible[_farthest(visible, num_points)]
     return clouds

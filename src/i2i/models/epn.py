@@ -14,6 +14,7 @@ from i2i.nn.anchor_trunk import (
     CLASS_WIDTHS,
     POSE_WIDTHS,
     AnchorTrunk,
+    check_cloud_size,
     pose_layers,
     rotation_head,
 )
@@ -72,7 +73,8 @@ class EPNPose(nn.Module):
         checkpointing: bool | None = None,
     ) -> None:
         super().__init__()
-        self.num_points, self.num_classes = num_points, num_classes
+        check_cloud_size(num_points)
+        self.num_classes = num_classes
         self.trunk = AnchorTrunk(
             tuple(width * factor for factor in POSE_WIDTHS),
             neighbours=neighbours,
@@ -171,7 +173,8 @@ class EPNClassifier(nn.Module):
         checkpointing: bool | None = None,
     ) -> None:
         super().__init__()
-        self.num_points, self.num_classes = num_points, num_classes
+        check_cloud_size(num_points)
+        self.num_classes = num_classes
         self.attention_weight = attention_weight
         self.trunk = AnchorTrunk(
             tuple(width * factor for factor in CLASS_WIDTHS),

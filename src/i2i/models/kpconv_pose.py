@@ -10,7 +10,13 @@ from torch import Tensor, nn
 
 from i2i.models.pooled import RotationLoss, append_class, class_size, known_class
 from i2i.models.prediction import PosePrediction
-from i2i.nn.anchor_trunk import POSE_WIDTHS, AnchorTrunk, pose_layers, rotation_head
+from i2i.nn.anchor_trunk import (
+    POSE_WIDTHS,
+    AnchorTrunk,
+    check_cloud_size,
+    pose_layers,
+    rotation_head,
+)
 from i2i.nn.precision import at_least_float32
 
 Batch = Mapping[str, Tensor]
@@ -49,7 +55,8 @@ class SingleAnchorPose(nn.Module):
         checkpointing: bool | None = None,
     ) -> None:
         super().__init__()
-        self.num_points, self.num_classes = num_points, num_classes
+        check_cloud_size(num_points)
+        self.num_classes = num_classes
         self.trunk = AnchorTrunk(
             tuple(width * factor for factor in POSE_WIDTHS),
             neighbours=neighbours,

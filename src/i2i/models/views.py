@@ -1,5 +1,6 @@
 """What the multi-view networks share: the pictures of an object, and one feature for each."""
 
+import inspect
 from pathlib import Path
 
 import torch
@@ -76,6 +77,11 @@ class ViewFeatures(nn.Module):
             raise ValueError(f"channels={channels}: views are gray (1) or in colour (3)")
         self.expected = (num_views, channels, image_size, image_size)
         if not isinstance(trunk, nn.Module):
+            if log_polar and "circular_rows" not in inspect.signature(trunk).parameters:
+                raise ValueError(
+                    "the trunk has no circular rows, which log-polar views need: set "
+                    "model.log_polar=false or model/trunk=resnet18"
+                )
             options = {"circular_rows": True} if log_polar else {}
             trunk = trunk(_COLOURS, image_size=image_size, **options)
         if not hasattr(trunk, "out_channels"):

@@ -79,8 +79,7 @@ class AnchorTrunk(nn.Module):
             ValueError: If the cloud is too small.
         """
         size = points.shape[1]
-        if size < _LEAST_POINTS:
-            raise ValueError(f"clouds of {size} points: this network needs {_LEAST_POINTS}")
+        check_cloud_size(size)
         points = at_least_float32(points)
         points = gather_points(points, farthest_point_sample(points, size))
         features = None
@@ -90,6 +89,16 @@ class AnchorTrunk(nn.Module):
             points = points[:, : features.shape[2]]
         assert features is not None
         return features, points
+
+
+def check_cloud_size(num_points: int) -> None:
+    """Refuse clouds of which the strides would leave nothing.
+
+    Raises:
+        ValueError: with the setting and the least number.
+    """
+    if num_points < _LEAST_POINTS:
+        raise ValueError(f"data.num_points={num_points}: this network needs {_LEAST_POINTS}")
 
 
 class QuaternionHead(nn.Module):

@@ -60,7 +60,7 @@ def legend(report: Report) -> str:
     unit = report.sections[0].columns[0].unit
     if unit == "parameters":
         return "Trainable parameters; ours are counted on freshly built networks."
-    what = "Median rotation error in degrees" if unit == "°" else "Percent of the test views"
+    what = "Median rotation error in degrees" if unit == "°" else "Percent of the test samples"
     return (
         f"{what}. Ours: mean over seeds ± their standard deviation where there are several, and "
         "the 95 % interval of the median of all seeds together, over resampled test instances."

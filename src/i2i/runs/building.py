@@ -110,7 +110,8 @@ def check_fit(config: DictConfig) -> None:
     if config.data.modality not in seen:
         raise ConfigurationError(
             f"model={model.name} does not see data.modality={config.data.modality}; it sees "
-            f"{', '.join(f'data.modality={name}' for name in seen)}"
+            f"{', '.join(f'data.modality={name}' for name in seen)}. Other networks see others: "
+            "docs/networks.md, and `python -m i2i.train --help` lists them"
         )
 
 

@@ -23,7 +23,7 @@ _LEFT_OUT_OF_TRAINER = (
 )  # fmt: skip
 _OF_CLOUDS = (
     "num_points", "cloud_image_size", "rotate_points", "point_dropout", "point_scale",
-    "point_shift", "point_noise",
+    "point_scale_per_axis", "point_shift", "point_noise",
 )  # fmt: skip
 _OF_IMAGES = ("image_size", "shift_px", "test_shift_px", "depth_shift", "test_depth_shift")
 # These watch a run; any other callback may change it.
@@ -48,10 +48,13 @@ def identity_config(config: dict[str, Any]) -> dict[str, Any]:
         if key not in _LEFT_OUT_OF_TRAINER and not key.startswith("enable_")
     }
     callbacks = {k: v for k, v in (config.get("callbacks") or {}).items() if k not in _WATCHING}
+    network = dict(model["networks"].get(task["name"]) or {})
+    if network.get("pretrained"):  # the file by its name: where it lies is no matter
+        network["pretrained"] = Path(network["pretrained"]).name
     kept = {
         "seed": config["seed"],
         "task": task,
-        "model": {"name": model["name"], "network": model["networks"].get(task["name"])},
+        "model": {"name": model["name"], "network": network or None},
         "data": _identity_of_data(config["data"]),
         "trainer": trainer,
         "callbacks": callbacks or None,
