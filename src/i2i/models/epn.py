@@ -16,11 +16,11 @@ from i2i.nn.anchor_trunk import (
     AnchorTrunk,
     check_cloud_size,
     pose_layers,
-    rotation_head,
 )
 from i2i.nn.heads import candidate_rotations, pose_target
 from i2i.nn.losses import ClassifyThenRegressLoss, GroupTarget, group_target
 from i2i.nn.precision import at_least_float32, full_precision
+from i2i.nn.rotation_heads import rotation_head
 
 SHARPNESS = 3.0  # the anchors' probabilities are softmax(3 · score)
 

@@ -15,9 +15,9 @@ from i2i.nn.anchor_trunk import (
     AnchorTrunk,
     check_cloud_size,
     pose_layers,
-    rotation_head,
 )
 from i2i.nn.precision import at_least_float32
+from i2i.nn.rotation_heads import rotation_head
 
 Batch = Mapping[str, Tensor]
 

@@ -2,15 +2,12 @@
 
 from itertools import pairwise
 
-import roma
-import torch
 from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import icosahedron
 from i2i.geometry.points import farthest_point_sample, gather_points
 from i2i.nn.anchor_conv import SeparableLayer
-from i2i.nn.precision import at_least_float32, full_precision
-from i2i.nn.rotation_heads import GramSchmidtHead
+from i2i.nn.precision import at_least_float32
 
 POSE_WIDTHS = (1, 1, 2, 2, 4, 4, 8)  # times the width
 CLASS_WIDTHS = (2, 2, 4, 4, 8, 8, 8)
@@ -21,7 +18,6 @@ _TABLE_POINTS = 1024  # of the clouds for which the original's numbers of neighb
 _LEAST_NEIGHBOURS = 8
 _LEAST_POINTS = 2**5  # two are left of them after the four strides
 _LEAST_CHANNELS = 16
-_SMALLEST_NORM = 1e-8  # of a quaternion that has a direction
 
 
 class AnchorTrunk(nn.Module):
@@ -99,54 +95,6 @@ def check_cloud_size(num_points: int) -> None:
     """
     if num_points < _LEAST_POINTS:
         raise ValueError(f"data.num_points={num_points}: this network needs {_LEAST_POINTS}")
-
-
-class QuaternionHead(nn.Module):
-    """A linear layer to a quaternion (x, y, z, w), normalised.
-
-    Args:
-        in_features: Length of the feature vector F.
-
-    Shape:
-        (..., F) -> (..., 3, 3); a zero quaternion is read as the identity.
-
-    Example:
-        >>> QuaternionHead(5)(torch.zeros(2, 5))[0]
-        tensor([[1., 0., 0.],
-                [0., 1., 0.],
-                [0., 0., 1.]], grad_fn=<SelectBackward0>)
-    """
-
-    def __init__(self, in_features: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(in_features, 4)
-        with torch.no_grad():  # around the identity, not around 0, where there is no rotation
-            self.linear.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 1.0]))
-
-    def forward(self, feature: Tensor) -> Tensor:
-        """Rotations of features, see the class."""
-        feature = at_least_float32(feature)
-        with full_precision(feature):
-            numbers = self.linear(feature)
-            norm = numbers.norm(dim=-1, keepdim=True)
-            unit = numbers / norm.clamp(min=_SMALLEST_NORM)
-            identity = numbers.new_tensor([0.0, 0.0, 0.0, 1.0])
-            return roma.unitquat_to_rotmat(torch.where(norm > _SMALLEST_NORM, unit, identity))
-
-
-ROTATION_HEADS = {"quaternion": QuaternionHead, "six": GramSchmidtHead}
-
-
-def rotation_head(in_features: int, kind: str) -> nn.Module:
-    """The last layer, from features to rotations, of a kind of `ROTATION_HEADS`.
-
-    Raises:
-        ValueError: If the kind is unknown.
-    """
-    if kind not in ROTATION_HEADS:
-        known = ", ".join(ROTATION_HEADS)
-        raise ValueError(f"representation={kind!r} is not known: choose one of {known}")
-    return ROTATION_HEADS[kind](in_features)
 
 
 def pose_layers(width: int) -> tuple[nn.Sequential, int]:

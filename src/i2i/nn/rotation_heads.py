@@ -13,6 +13,7 @@ from i2i.nn.precision import at_least_float32, full_precision
 
 SIGN_CLASSES = 8
 _IDENTITY_SIX = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+_IDENTITY_QUATERNION = (0.0, 0.0, 0.0, 1.0)
 _IDENTITY_NINE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALLEST_NORM = 1e-8
 
@@ -53,6 +54,37 @@ class GramSchmidtHead(nn.Module):
         feature = at_least_float32(feature)
         with full_precision(feature):
             return gram_schmidt(self.linear(feature))
+
+
+class QuaternionHead(nn.Module):
+    """A linear layer to a quaternion (x, y, z, w), normalised.
+
+    Args:
+        in_features: Length of the feature vector F.
+
+    Shape:
+        (..., F) -> (..., 3, 3); a zero quaternion is read as the identity.
+
+    Example:
+        >>> QuaternionHead(5)(torch.zeros(2, 5))[0]
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]], grad_fn=<SelectBackward0>)
+    """
+
+    def __init__(self, in_features: int) -> None:
+        super().__init__()
+        self.linear = _identity_biased(in_features, _IDENTITY_QUATERNION)
+
+    def forward(self, feature: Tensor) -> Tensor:
+        """Rotations (..., 3, 3) of features (..., F)."""
+        feature = at_least_float32(feature)
+        with full_precision(feature):
+            numbers = self.linear(feature)
+            norm = numbers.norm(dim=-1, keepdim=True)
+            unit = numbers / norm.clamp(min=_SMALLEST_NORM)
+            identity = numbers.new_tensor(_IDENTITY_QUATERNION)
+            return roma.unitquat_to_rotmat(torch.where(norm > _SMALLEST_NORM, unit, identity))
 
 
 class ProcrustesHead(nn.Module):
@@ -281,3 +313,18 @@ def _turn_about_z(u: Tensor) -> Tensor:
     zero, one = torch.zeros_like(cos), torch.ones_like(cos)
     rows = [(cos, -sin, zero), (sin, cos, zero), (zero, zero, one)]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+ROTATION_HEADS = {"quaternion": QuaternionHead, "six": GramSchmidtHead}
+
+
+def rotation_head(in_features: int, kind: str) -> nn.Module:
+    """The last layer, from features to rotations, of a kind of `ROTATION_HEADS`.
+
+    Raises:
+        ValueError: If the kind is unknown.
+    """
+    if kind not in ROTATION_HEADS:
+        known = ", ".join(ROTATION_HEADS)
+        raise ValueError(f"representation={kind!r} is not known: choose one of {known}")
+    return ROTATION_HEADS[kind](in_features)
