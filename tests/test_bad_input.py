@@ -223,6 +223,17 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_says_how_to_go_on(tmp_path, breaks
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
 
 
+def test_ctrl_c_before_the_first_checkpoint_says_that_there_is_none(
+    tmp_path, breaks_at_step, capfd
+):
+    breaks_at_step(2, raise_(KeyboardInterrupt()))
+    with pytest.raises(SystemExit):
+        train(tiny_run(tmp_path))
+    told = capfd.readouterr().err
+    assert "before the first checkpoint" in told
+    assert "resume=" not in told
+
+
 def test_a_full_disk_in_training_leaves_the_last_checkpoint_whole(tmp_path, breaks_at_step):
     full = OSError(errno.ENOSPC, "No space left on device")
     breaks_at_step(7, raise_(full))

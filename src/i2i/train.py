@@ -251,6 +251,12 @@ def _close_broken(folder: RunFolder, trainer: Trainer, error: BaseException) -> 
             f"python -m i2i.train resume={folder.path}",
             file=sys.stderr,
         )
+    elif interrupted:
+        print(
+            "stopped before the first checkpoint: there is nothing to go on from; type the same "
+            "command again",
+            file=sys.stderr,
+        )
 
 
 @rank_zero_only
