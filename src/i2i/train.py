@@ -124,8 +124,8 @@ def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
     if trainer.is_global_zero:
         _open(folder, config, identity, resumed=bool(cfg.resume))
     try:
+        task = build_task(cfg, datamodule.info)  # what does not fit is told before the rendering
         datamodule.prepare_data()
-        task = build_task(cfg, datamodule.info)
         _run_stages(cfg, folder, trainer, task, datamodule)
         metrics = finish(folder, trainer, task, datamodule, config=config, identity=identity)
     except BaseException as error:
