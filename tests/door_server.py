@@ -17,6 +17,7 @@ DOORS = ("train", "evaluate", "predict", "render", "report", "check")
 
 
 def main() -> None:
+    importlib.import_module("i2i.training")  # of the train door, when it has something to do
     for name in DOORS:
         importlib.import_module(f"i2i.{name}")
         del sys.modules[f"i2i.{name}"]  # runpy executes it again, as -m does

@@ -16,7 +16,7 @@ from i2i.evaluate import evaluate
 from i2i.predictor import Predictor
 from i2i.runs.building import build_datamodule, build_network, build_task, check_fit, info_of
 from i2i.runs.loading import load_task, load_weights, locate, read_checkpoint
-from i2i.train import train
+from i2i.training import train
 
 TINY = ["scale=tiny", "trainer.accelerator=cpu"]
 

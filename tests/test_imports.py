@@ -51,8 +51,9 @@ def test_nothing_imports_a_door():
         assert not {n.split(".")[0] for n in imports(path)} & DOORS, path
 
 
-def test_rendering_processes_do_not_load_torch():
-    script = "import sys, i2i.data.render_worker; print('torch' in sys.modules)"
+@pytest.mark.parametrize("module", ["data.render_worker", "train", "download"])
+def test_rendering_processes_and_help_do_not_wait_for_torch(module):
+    script = f"import sys, i2i.{module}; print('torch' in sys.modules)"
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

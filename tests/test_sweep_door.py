@@ -20,7 +20,7 @@ from i2i.reports.build import build_report
 from i2i.reports.markdown import markdown
 from i2i.reports.paper import load_paper
 from i2i.reports.results import read_results
-from i2i.train import refuse_table, train
+from i2i.training import refuse_table, train
 
 TINY = (
     "scale=tiny", "data.source.instances_per_class=6", "data.source.test_instances_per_class=3",

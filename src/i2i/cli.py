@@ -8,7 +8,6 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -16,10 +15,9 @@ from i2i.configuration import config_dir, register_resolvers
 from i2i.errors import ConfigurationError, I2IError
 
 # OSError: a disk that is full, a file that may not be read; the rest are settings that do not fit.
-_CAUSED_BY_USERS = (
-    I2IError, ValueError, OSError, HydraException, OmegaConfBaseException,
-    MisconfigurationException,
-)  # fmt: skip
+_CAUSED_BY_USERS = (I2IError, ValueError, OSError, HydraException, OmegaConfBaseException)
+# Lightning's, by its name: importing it takes seconds, and `--help` has no need of it.
+_OF_LIGHTNING = "MisconfigurationException"
 
 
 def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callable[[], None]]:
@@ -37,7 +35,9 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
         def shell(cfg: DictConfig) -> None:
             try:
                 function(cfg)
-            except _CAUSED_BY_USERS as error:
+            except Exception as error:
+                if not _caused_by_user(error):
+                    raise
                 if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(f"error: {readable(error)}", file=sys.stderr)
@@ -53,12 +53,16 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
     return decorate
 
 
+def _caused_by_user(error: Exception) -> bool:
+    return isinstance(error, _CAUSED_BY_USERS) or type(error).__name__ == _OF_LIGHTNING
+
+
 def readable(error: BaseException) -> str:
     """The message of the error inside what Hydra and OmegaConf wrapped around it."""
     inner: BaseException | None = error
     while inner is not None:
         if isinstance(inner, I2IError) or (
-            inner is not error and type(inner) in (ValueError, MisconfigurationException)
+            inner is not error and type(inner).__name__ in ("ValueError", _OF_LIGHTNING)
         ):
             return str(inner)
         inner = inner.__cause__
