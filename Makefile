@@ -1,6 +1,6 @@
 # make demo   renders chairs, trains I2I on them, evaluates it, draws what it predicts
 # make test   the test suite          make lint   ruff, mypy, yamllint, codespell
-# make table  the README's table, from results/
+# make table  the choices inside I2I, from results/ (docs/results.md)
 PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python

@@ -2,6 +2,10 @@
 
 import errno
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,14 +13,16 @@ import torch
 from hydra.errors import HydraException
 from omegaconf import open_dict
 
+from i2i.cli import readable
 from i2i.configuration import compose
 from i2i.data.info import DataInfo
 from i2i.errors import CheckpointError, ConfigurationError, NonFiniteLossError
 from i2i.evaluate import evaluate
 from i2i.predictor import Predictor
 from i2i.runs.building import build_datamodule, build_network, build_task, check_fit, info_of
-from i2i.runs.loading import load_task, load_weights, locate, read_checkpoint
-from i2i.training import train
+from i2i.runs.folder import RunFolder
+from i2i.runs.loading import load_task, load_weights, locate, move_to, read_checkpoint
+from i2i.training import LOCKS, train
 
 TINY = ["scale=tiny", "trainer.accelerator=cpu"]
 
@@ -234,13 +240,95 @@ def test_ctrl_c_before_the_first_checkpoint_says_that_there_is_none(
     assert "resume=" not in told
 
 
-def test_a_full_disk_in_training_leaves_the_last_checkpoint_whole(tmp_path, breaks_at_step):
-    full = OSError(errno.ENOSPC, "No space left on device")
-    breaks_at_step(7, raise_(full))
-    with pytest.raises(OSError, match="No space left"):
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_in_training_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch, capfd):
+    """Full when the second checkpoint is half written, and for the status after it."""
+    write = torch.save
+
+    def fail(*_, **__):
+        raise FULL
+
+    def save(content, stream):
+        write(content, stream)
+        if content["global_step"] > 5:
+            monkeypatch.setattr(RunFolder, "write_status", fail)
+            fail()
+
+    monkeypatch.setattr(torch, "save", save)
+    with pytest.raises(OSError, match="No space left") as caught:
         train(tiny_run(tmp_path))
-    assert state(tmp_path) == "failed"
-    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["global_step"] == 5
+    assert f"resume={tmp_path}/run" in capfd.readouterr().err
+    assert "the disk is full" in readable(caught.value)
+    folder = tmp_path / "run" / "checkpoints"
+    assert read_checkpoint(folder / "last.ckpt")["global_step"] == 5
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_run_that_got_nowhere_may_be_begun_again(tmp_path, breaks_at_step):
+    times = []
+
+    def only_once(loss):
+        times.append(1)
+        if len(times) == 1:
+            raise KeyboardInterrupt
+        return loss
+
+    breaks_at_step(2, only_once)
+    with pytest.raises(SystemExit):
+        train(tiny_run(tmp_path))
+    train(tiny_run(tmp_path))
+    assert state(tmp_path) == "done"
+
+
+def test_a_setting_that_does_not_fit_leaves_no_run_folder(tmp_path):
+    with pytest.raises(HydraException):
+        train(tiny_run(tmp_path, "model.projector.sigma=-1"))
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+def test_a_run_that_is_running_is_not_resumed(tmp_path):
+    train(tiny_run(tmp_path, "trainer.max_steps=2", "run=[fit]", f"paths.runs_dir={tmp_path}"))
+    script = (
+        "import sys, time; from pathlib import Path; from i2i.runs.locks import job_lock\n"
+        "with job_lock(Path(sys.argv[1]), sys.argv[2]) as ours: print(ours, flush=True); "
+        "time.sleep(60)"
+    )
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    other = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / LOCKS), status["config_hash"]],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert other.stdout.readline().strip() == "True"
+        with pytest.raises(ConfigurationError, match=f"is running.*process {other.pid}"):
+            train(compose([f"resume={tmp_path}/run"]))
+    finally:
+        other.kill()
+        other.wait()
+
+
+def test_a_device_that_is_not_there_is_refused():
+    if torch.cuda.is_available():
+        pytest.skip("it is there")
+    with pytest.raises(ConfigurationError, match=r"device=cuda.*use device=cpu"):
+        move_to(torch.nn.Linear(1, 1), "cuda")
+
+
+def test_ctrl_c_while_rendering_says_that_it_goes_on(tmp_path):
+    words = ["data=synthetic", "data.object=chair", "scale=small", "data.render_workers=0"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "i2i.render", *words], cwd=tmp_path, stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while not any(tmp_path.glob("data/renders/**/*.npy*")) and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "the same command again goes on" in told
+    assert "Traceback" not in told
 
 
 def test_a_second_run_never_overwrites_the_first(tmp_path):

@@ -15,7 +15,7 @@ from i2i.errors import ConfigurationError, I2IError
 from i2i.rendering.base import MODALITIES
 from i2i.runs.building import build_datamodule, follow_root
 from i2i.runs.folder import write_json
-from i2i.runs.loading import load_task, locate
+from i2i.runs.loading import load_task, locate, move_to
 from i2i.testing.measured import measure
 from i2i.viz.equivariance import equivariance_figure, equivariance_table
 from i2i.viz.style import save_figure
@@ -52,7 +52,7 @@ def check(cfg: DictConfig) -> dict[str, Any]:
     batch, notice = noise_batch(task.info, cfg.images), ""
     if not cfg.noise:
         batch, notice = _test_images(cfg, task.run_config, batch)
-    network = task.network.to(cfg.device)
+    network = move_to(task.network, cfg.device)
     batch = {name: value.to(cfg.device) for name, value in batch.items()}
     rows = measure(network, batch, symmetry=task.info.symmetry)
     content = {

@@ -1,5 +1,6 @@
 """The shell around every door: Hydra on the outside, plain error messages on the way out."""
 
+import errno
 import os
 import sys
 from collections.abc import Callable
@@ -35,6 +36,11 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
         def shell(cfg: DictConfig) -> None:
             try:
                 function(cfg)
+            except KeyboardInterrupt:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise
+                print("stopped; the same command again goes on", file=sys.stderr)
+                sys.exit(130)
             except Exception as error:
                 if not _caused_by_user(error):
                     raise
@@ -59,6 +65,12 @@ def _caused_by_user(error: Exception) -> bool:
 
 def readable(error: BaseException) -> str:
     """The message of the error inside what Hydra and OmegaConf wrapped around it."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return (
+            f"the disk is full ({error}). Make room, or put runs and data elsewhere "
+            "(paths.runs_dir=, paths.data_dir=); what is made is kept, and the same command or "
+            "resume=<the run's folder> goes on"
+        )
     inner: BaseException | None = error
     while inner is not None:
         if isinstance(inner, I2IError) or (

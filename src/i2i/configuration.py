@@ -77,7 +77,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def slug(value: object) -> str:
-    """A value as part of a file name: letters, digits, `.`, `_` and `-`;."""
+    """A value as part of a file name: letters, digits, `.`, `_` and `-`."""
     if OmegaConf.is_config(value):
         value = OmegaConf.to_container(value)
     text = "-".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -24,7 +24,7 @@ from i2i.models.prediction import PosePrediction
 from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.reference import load_mesh
-from i2i.runs.loading import load_task, locate
+from i2i.runs.loading import load_task, locate, move_to
 from i2i.viz.inputs import input_pictures
 
 SAME_ANSWER_DEG = 15.0
@@ -281,7 +281,7 @@ def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> Predict
     folder, path = locate(run, ckpt)
     task = load_task(path)
     return Predictor(
-        task.network.to(device),
+        move_to(task.network, device),
         task.info,
         config=task.run_config,
         run_folder=folder.path,

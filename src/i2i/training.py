@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import traceback
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from i2i.callbacks.steps import StopAfterSteps
 from i2i.cli import given_overrides, refuse
 from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
-from i2i.errors import ConfigurationError, I2IError
+from i2i.errors import ConfigurationError, I2IError, NonFiniteLossError
 from i2i.finishing import finish
 from i2i.runs.building import build_datamodule, build_task, follow_root
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
@@ -35,6 +35,7 @@ from i2i.runs.identity import config_hash
 from i2i.runs.loading import load_weights, read_checkpoint
 from i2i.runs.locks import holder, job_lock
 from i2i.runs.progress import find_broken, find_done
+from i2i.runs.saving import AtomicCheckpointIO
 from i2i.sweeping import JobFailedError, one_line
 from i2i.tasks.base import Task
 
@@ -83,9 +84,18 @@ def train(cfg: DictConfig) -> RunResult:
     runs_dir = Path(cfg.paths.runs_dir)
     with ExitStack() as stack:
         if folder.path.resolve().parent == runs_dir.resolve():
-            # Only told, not asked: a sweep leaves this job alone while it runs.
-            stack.enter_context(job_lock(runs_dir / LOCKS, identity))
+            ours = stack.enter_context(job_lock(runs_dir / LOCKS, identity))
+            if cfg.resume and not (ours or _is_one_of_several()):
+                raise ConfigurationError(
+                    f"resume={cfg.resume}: this job is running "
+                    f"({holder(runs_dir / LOCKS, identity)}); wait for it or stop it"
+                )
         return _train(cfg, folder, identity)
+
+
+def _is_one_of_several() -> bool:
+    """Whether this process is one of those of a run on several devices, which share its lock."""
+    return any(name in os.environ for name in ("LOCAL_RANK", "RANK", "SLURM_PROCID"))
 
 
 def train_in_sweep(cfg: DictConfig) -> RunResult | None:
@@ -121,10 +131,10 @@ def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
     seed_everything(cfg.seed, workers=True, verbose=False)
     datamodule = build_datamodule(cfg)
     trainer = _trainer(cfg, folder)
+    task = build_task(cfg, datamodule.info)  # what does not fit is told before anything is made
     if trainer.is_global_zero:
         _open(folder, config, identity, resumed=bool(cfg.resume))
     try:
-        task = build_task(cfg, datamodule.info)  # what does not fit is told before the rendering
         datamodule.prepare_data()
         _run_stages(cfg, folder, trainer, task, datamodule)
         metrics = finish(folder, trainer, task, datamodule, config=config, identity=identity)
@@ -194,10 +204,12 @@ def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
         epochs = -(-cfg.trainer.max_steps // epoch) if epoch else -1
         length = {"max_steps": -1, "max_epochs": epochs}
     logger = instantiate(cfg.logger, save_dir=str(folder.path)) if cfg.logger else False
+    plugins = [instantiate(plugin) for plugin in cfg.trainer.get("plugins") or ()]
     trainer: Trainer = instantiate(
         cfg.trainer,
         **length,
         callbacks=callbacks,
+        plugins=[AtomicCheckpointIO(), *plugins],
         logger=logger,
         default_root_dir=str(folder.path),
         _convert_="all",
@@ -208,7 +220,7 @@ def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
 
 def _open(folder: RunFolder, config: dict[str, Any], identity: str, *, resumed: bool) -> None:
     if not resumed:
-        if folder.config.exists() and not _in_sweep():  # there: a run that got nowhere
+        if folder.config.exists() and not _in_sweep() and not folder.got_nowhere():
             raise ConfigurationError(
                 f"{folder.path} holds a run already: go on with it by resume={folder.path}, or "
                 "choose another run_name"
@@ -240,12 +252,13 @@ def _run_stages(
 
 
 def _close_broken(folder: RunFolder, trainer: Trainer, error: BaseException) -> None:
-    """Leave a status behind, and tell how to go on."""
+    """Tell how to go on, and leave a status behind."""
     if not trainer.is_global_zero or not folder.status.exists():
         return
     interrupted = isinstance(error, KeyboardInterrupt | SystemExit)
-    folder.write_status("interrupted" if interrupted else "failed", error=str(error)[:500])
-    if (folder.checkpoints / "last.ckpt").is_file():
+    if isinstance(error, NonFiniteLossError):
+        pass  # going on would come to the same; the error itself says what to change
+    elif (folder.checkpoints / "last.ckpt").is_file():
         print(
             f"stopped; the last checkpoint is kept. Go on with:  "
             f"python -m i2i.train resume={folder.path}",
@@ -257,6 +270,8 @@ def _close_broken(folder: RunFolder, trainer: Trainer, error: BaseException) -> 
             "command again",
             file=sys.stderr,
         )
+    with suppress(OSError):  # the disk may be what is full
+        folder.write_status("interrupted" if interrupted else "failed", error=str(error)[:500])
 
 
 @rank_zero_only

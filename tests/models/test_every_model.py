@@ -53,10 +53,15 @@ PARAMETERS = {
 }
 # Variants whose size the paper leaves open: as large as I2I.
 LIKE_I2I = {"i2i_no_groupconv": 0.02, "i2sphere": 0.03}
+# How well `small` keeps the ratio, where better than to a tenth.
+SAME_RATIO = {"i2sphere": 0.02, "i2i_no_groupconv": 0.02, "i2i_no_groupconv_pooled": 0.02,
+              "i2i_sparse": 0.04, "i2i_vector": 0.04, "i2i_full_group_local13": 0.04,
+              "i2i_twofold": 0.04, "i2i_no_e2cnn": 0.04}  # fmt: skip
 # cnn_ier's corrections begin at zero, which stops the gradient of what lies below for a step.
 STEPS_TO_REACH_ALL = {"cnn_ier": 2}
 # The first shortcut sees ones alone, and its batch norm takes them away.
 IDLE = {("epn", "classification"): "trunk.layers.0.shortcut_norm.batch.weight"}
+NO_STATISTICS = ("shortcut.bias", "score.bias", "attention.bias")
 # Random in training otherwise.
 NOT_RANDOM = {"pointnet2": ["dropout=0", "random_start=false"]}
 
@@ -99,7 +104,7 @@ def test_small_keeps_the_ratio_to_i2i(model, task):
         size(model, task, scale, classes) / size("i2i", task, scale, classes)
         for scale in ("paper", "small")
     )
-    assert small == pytest.approx(paper, rel=0.1)
+    assert small == pytest.approx(paper, rel=SAME_RATIO.get(model, 0.1))
 
 
 @pytest.mark.parametrize(("model", "task"), NETWORKS)
@@ -121,18 +126,24 @@ def test_one_step_changes_every_parameter(model, task, num_classes):
 
 
 def _taken_away_by_norm(net, name, given):
-    """Whether a parameter is a bias before a norm that takes means away: no value has an effect."""
+    """Whether a bias has no effect on a batch's own statistics, and one on the running ones.
+
+    Instance norms and the softmax over anchors, of `epn`, have no running ones.
+    """
     if not name.endswith("bias"):
         return False
-    moved, losses = copy.deepcopy(net).eval(), []
-    for module in moved.modules():  # batch statistics without randomness
-        if "Norm" in type(module).__name__:
-            module.train()
-    for shift in (0.0, 0.5):
-        with torch.no_grad():
-            moved.get_parameter(name).add_(shift)
-            losses.append(total_loss(moved, given).item())
-    return losses[1] == pytest.approx(losses[0], rel=1e-4)
+    changes = {}
+    for statistics in ("batch", "running"):
+        moved, losses = copy.deepcopy(net).eval(), []
+        for module in moved.modules():  # without randomness
+            if "Norm" in type(module).__name__:
+                module.train(statistics == "batch")
+        for shift in (0.0, 0.5):
+            with torch.no_grad():
+                moved.get_parameter(name).add_(shift)
+                losses.append(total_loss(moved, given).item())
+        changes[statistics] = abs(losses[1] / losses[0] - 1)
+    return changes["batch"] < 1e-4 and (changes["running"] > 1e-4 or name.endswith(NO_STATISTICS))
 
 
 @pytest.mark.parametrize(("model", "task"), NETWORKS)

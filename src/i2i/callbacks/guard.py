@@ -85,9 +85,17 @@ class NonFiniteLossGuard(Callback):
             f"{what} at optimiser step {trainer.global_step} (epoch {trainer.current_epoch}, "
             f"batch {self._batch_idx}{_describe(self._batch)}). Training stopped before this "
             f"reached the weights. {_last_checkpoint(trainer)} If the batch's images are fine, "
-            "lower the learning rate (scale.optimizer.lr=), clip gradients "
-            "(trainer.gradient_clip_val=10) or use trainer.precision=32."
+            f"lower the learning rate ({_rate_of(trainer.lightning_module)}=), clip gradients "
+            "(trainer.gradient_clip_val=10) or use trainer.precision=32, and train again."
         )
+
+
+def _rate_of(task: LightningModule | None) -> str:
+    """The setting of the learning rate: a network with a recipe of its own has it there."""
+    config = getattr(task, "run_config", None) or {}
+    recipe = (config.get("scale") or {}).get("recipe")
+    own = ((config.get("model") or {}).get("recipes") or {}).get(recipe) or {}
+    return f"model.recipes.{recipe}.optimizer.lr" if "optimizer" in own else "scale.optimizer.lr"
 
 
 def _sums(gradients: list[Tensor]) -> list[Tensor]:

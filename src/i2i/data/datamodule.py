@@ -51,7 +51,8 @@ class RenderedDataModule(ImageDataModule):
         folds: Number of folds.
         seed: Seed of the views and of the split.
         strip_symmetry: Remove the rotation about z from the labels of z-symmetric classes.
-        symmetry: ``"none"`` or ``"z"`` for all classes, or by class; None for the source's own.
+        symmetry: ``"none"``, ``"z"`` or ``"z2"`` for all classes, or by class; None for the
+            source's own.
         render_workers: Rendering processes; None for one per processor.
         store_root: Folder of the rendered stores.
         strict: Stop at a mesh that cannot be read, instead of leaving it out.

@@ -37,7 +37,7 @@ class LabelledImagesDataModule(ImageDataModule):
         quaternion_order: ``"xyzw"`` or ``"wxyz"``, for columns that do not say it themselves.
         camera_distance: Recorded for drawing only.
         camera_fov_deg: Recorded for drawing only.
-        symmetry: ``"none"`` or ``"z"`` for all classes, or by class.
+        symmetry: ``"none"``, ``"z"`` or ``"z2"`` for all classes, or by class.
         strip_symmetry: Remove the rotation about z from the labels of z-symmetric classes.
         val_fraction: Share of the pictures that are not for test, for validation.
         test_fraction: Share of the pictures for test.

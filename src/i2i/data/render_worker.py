@@ -113,7 +113,7 @@ class RenderContext:
         rotations = np.stack([view_rotation(**address) for address in self._addresses(chunk)])
         try:
             content = self._rows(mesh, rotations, chunk)
-        except MeshError as error:  # a view that shows nothing of the object
+        except MeshError as error:  # a view that shows hardly anything of the object
             return str(error)
         write_chunk(chunk, ChunkData(content, rotations, mesh.object_from_mesh))
         return None
@@ -136,7 +136,7 @@ class RenderContext:
         """Main array of the views: images, clouds or view sets.
 
         Raises:
-            MeshError: if a partial cloud has no point.
+            MeshError: if a partial cloud has hardly a point.
         """
         settings = self.settings
         camera = Camera(distance=settings.camera_distance, fov_deg=settings.camera_fov_deg)
@@ -254,8 +254,8 @@ def _render_in_worker(chunk: Chunk) -> str | None:
 def _light_start(context: RenderContext) -> Iterator[None]:
     """Let worker processes start without importing the main program and with one thread each.
 
-    A spawned process imports the parent's main module, here a door that pulls in torch and
-    Lightning, which takes longer than rendering a small data set.
+    A spawned process imports the parent's main module, which may pull in torch and Lightning; that
+    takes longer than rendering a small data set.
     """
     needs_main = "__main__" in (type(context.source).__module__, type(context.renderer).__module__)
     main = sys.modules["__main__"]

@@ -78,6 +78,11 @@ class RunFolder:
             )
         return path
 
+    def got_nowhere(self) -> bool:
+        """Whether the run ended before it had a checkpoint, so that nothing would be lost."""
+        state = read_json(self.status).get("state") if self.status.exists() else "failed"
+        return state in ("failed", "interrupted") and not any(self.checkpoints.glob("*.ckpt"))
+
     def write_status(self, state: str, **more: Any) -> None:  # noqa: ANN401 - JSON values
         """Record the state (`running`, `done`, `interrupted`, `failed`) and what goes with it."""
         status = read_json(self.status) if self.status.exists() else {}
@@ -111,5 +116,8 @@ def versions() -> dict[str, str]:
 def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text)
-    temporary.replace(path)
+    try:
+        temporary.write_text(text)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

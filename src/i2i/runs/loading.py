@@ -5,12 +5,27 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from i2i.data.info import DataInfo
-from i2i.errors import CheckpointError
+from i2i.errors import CheckpointError, ConfigurationError
 from i2i.runs.building import build_task
 from i2i.runs.folder import RunFolder
 from i2i.tasks.base import CHECKPOINT_FORMAT, Task
+
+
+def move_to(network: nn.Module, device: str | torch.device) -> nn.Module:
+    """The network on a device.
+
+    Raises:
+        ConfigurationError: if this machine, or this build of torch, does not have it.
+    """
+    try:
+        return network.to(device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigurationError(
+            f"device={device} is not to be had here ({error}); use device=cpu"
+        ) from error
 
 
 def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
@@ -21,7 +36,8 @@ def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
     """
     path = Path(run)
     if path.is_file():
-        return RunFolder(path.resolve().parent.parent), path
+        beside = path.resolve().parent
+        return RunFolder(beside.parent if beside.name == "checkpoints" else beside), path
     if not path.is_dir():
         raise CheckpointError(
             f"run={run}: no such run folder or checkpoint; `ls -t runs` shows the newest runs"

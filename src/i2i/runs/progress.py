@@ -16,7 +16,7 @@ def find_done(config: dict[str, Any], identity: str) -> Path | None:
     results_dir = config["paths"]["results_dir"]
     tested = "test" in config["run"]
     if results_dir and tested:
-        for path in sorted(Path(results_dir).rglob(f"*{identity}.json")):
+        for path in sorted(Path(results_dir).glob(f"*{identity}.json")):
             if _read(path).get("config_hash") == identity:
                 return path
     for folder, status in _runs_of(config, identity):

@@ -38,8 +38,8 @@ class Meshes(MeshSource):
         root: The folder or the file.
         up_axis: The meshes' axis that points up. ``None`` means z, except where all files are
             glTF, whose standard says y; a mixture must be told.
-        symmetry: ``"none"`` or ``"z"`` for all classes, or a mapping for some. Unlike the public
-            data sets, no class is symmetric because of its name.
+        symmetry: ``"none"``, ``"z"`` or ``"z2"`` for all classes, or a mapping for some. Unlike the
+            public data sets, no class is symmetric because of its name.
 
     Raises:
         DatasetNotFoundError: ``root`` is not set, is not there, or holds no mesh file.
