@@ -317,7 +317,8 @@ def test_a_device_that_is_not_there_is_refused():
 
 
 def test_ctrl_c_while_rendering_says_that_it_goes_on(tmp_path):
-    words = ["data=synthetic", "data.object=chair", "scale=small", "data.render_workers=0"]
+    words = ["data=synthetic", "data.object=chair", "scale=small", "data.render_workers=0",
+             "data.source.instances_per_class=400"]  # fmt: skip
     process = subprocess.Popen(
         [sys.executable, "-m", "i2i.render", *words], cwd=tmp_path, stderr=subprocess.PIPE,
         stdout=subprocess.PIPE, text=True,

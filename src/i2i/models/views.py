@@ -77,7 +77,7 @@ class ViewFeatures(nn.Module):
             raise ValueError(f"channels={channels}: views are gray (1) or in colour (3)")
         self.expected = (num_views, channels, image_size, image_size)
         if not isinstance(trunk, nn.Module):
-            if log_polar and "circular_rows" not in inspect.signature(trunk).parameters:
+            if log_polar and not _takes(trunk, "circular_rows"):
                 raise ValueError(
                     "the trunk has no circular rows, which log-polar views need: set "
                     "model.log_polar=false or model/trunk=resnet18"
@@ -105,3 +105,9 @@ class ViewFeatures(nn.Module):
         out = self.trunk((pictures - self.mean) / self.std)  # gray becomes three channels
         feature = pool(out) if out.ndim == 4 else at_least_float32(out)
         return feature.unflatten(0, (len(views), -1))
+
+
+def _takes(component: Component, option: str) -> bool:
+    """Whether a component can be made with an option."""
+    parameters = inspect.signature(component).parameters.values()
+    return any(p.name == option or p.kind is p.VAR_KEYWORD for p in parameters)

@@ -112,6 +112,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if found != CHECKPOINT_FORMAT:
         raise CheckpointError(
             f"{path} has format {found}, this version of i2i reads format {CHECKPOINT_FORMAT}: "
-            "install the version named in the run's versions.json, or train again"
+            "train again, or use the version that wrote it"
         )
     return checkpoint
