@@ -321,6 +321,8 @@ def test_ctrl_c_while_rendering_says_that_it_goes_on(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "i2i.render", *words], cwd=tmp_path, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True,
+        # A suite in the background of a script inherits that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     while "Rendered" not in process.stdout.readline():
         assert process.poll() is None

@@ -198,6 +198,36 @@ def test_one_image_and_evaluation(model, task):
         assert torch.linalg.det(rotation) > 0.99
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
+@pytest.mark.parametrize(("model", "task"), NETWORKS)
+def test_a_gpu_computes_what_the_cpu_does(model, task):
+    """In float64, so that losses, gradients and answers differ by rounding alone."""
+    words = [f"model.networks.{task}.{word}" for word in NOT_RANDOM.get(model, ())]
+    net, info = network(
+        model, task, scale="tiny", num_classes=1 if task == "pose" else 4, words=words
+    )
+    given = {
+        name: value.double() if value.is_floating_point() else value
+        for name, value in noise_batch(info, 6).items()
+    }
+    on_gpu = {name: value.cuda() for name, value in given.items()}
+    cpu = net.double().train()
+    gpu = copy.deepcopy(cpu).cuda()
+    losses = [total_loss(cpu, given), total_loss(gpu, on_gpu)]
+    assert losses[1].item() == pytest.approx(losses[0].item(), rel=1e-8)
+    for loss in losses:
+        loss.backward()
+    ours, theirs = (
+        {name: p.grad.cpu() for name, p in net.named_parameters() if p.grad is not None}
+        for net in (cpu, gpu)
+    )
+    torch.testing.assert_close(theirs, ours, rtol=1e-6, atol=1e-8)
+    field = "rotation" if task == "pose" else "logits"
+    with torch.no_grad():
+        answers = [getattr(cpu.eval()(given), field), getattr(gpu.eval()(on_gpu), field).cpu()]
+    torch.testing.assert_close(answers[1], answers[0], rtol=1e-6, atol=1e-8)
+
+
 @pytest.mark.parametrize(("model", "task"), OF_IMAGES)
 def test_sees_colour(model, task):
     classes = 1 if task == "pose" else 4
