@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from i2i.configuration import config_dir, register_resolvers
 from i2i.errors import ConfigurationError, I2IError
+from i2i.memory import reuse_memory
 
 # OSError: a disk that is full, a file that may not be read; the rest are settings that do not fit.
 _CAUSED_BY_USERS = (I2IError, ValueError, OSError, HydraException, OmegaConfBaseException)
@@ -50,6 +51,7 @@ def door(config_name: str) -> Callable[[Callable[[DictConfig], object]], Callabl
                 sys.exit(1)
 
         def main() -> None:
+            reuse_memory()
             register_resolvers()
             shell()
 

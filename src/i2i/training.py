@@ -29,6 +29,7 @@ from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError, I2IError, NonFiniteLossError
 from i2i.finishing import finish
+from i2i.nn.c4_dispatch import set_convolution_mode
 from i2i.runs.building import build_datamodule, build_task, follow_root
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
 from i2i.runs.identity import config_hash
@@ -129,6 +130,7 @@ def train_in_sweep(cfg: DictConfig) -> RunResult | None:
 def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
     config = plain(cfg)
     seed_everything(cfg.seed, workers=True, verbose=False)
+    set_convolution_mode(cfg.convolution)
     datamodule = build_datamodule(cfg)
     trainer = _trainer(cfg, folder)
     task = build_task(cfg, datamodule.info)  # what does not fit is told before anything is made

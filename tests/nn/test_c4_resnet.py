@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 
+from i2i.nn.c4_dispatch import convolution_mode
 from i2i.nn.c4_resnet import STEM_MODES, C4ResNet18, disc_mask
 from i2i.testing import assert_c4_equivariant
 
@@ -99,11 +100,12 @@ def test_empty_picture_is_zero_inside():
     encoder = small()
     seen = []
     encoder.stem.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    encoder(torch.ones(1, 1, 32, 32))
-    assert torch.equal(seen[0], torch.zeros(1, 1, 32, 32))
     picture = torch.ones(1, 1, 32, 32)
     picture[0, 0, 0, 0] = 0.0  # a corner outside the disc
-    encoder(picture)
+    with convolution_mode("dense"):
+        encoder(torch.ones(1, 1, 32, 32))
+        encoder(picture)
+    assert torch.equal(seen[0], torch.zeros(1, 1, 32, 32))
     assert seen[1].abs().max() < 1e-6
 
 

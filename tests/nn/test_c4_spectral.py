@@ -9,13 +9,14 @@ from torch.nn import functional
 
 from i2i.nn.c4_spectral import (
     base_filters,
-    is_supported,
-    prefers_spectral,
     spectral_conv2d,
     spectral_conv2d_base,
     spectral_product,
     transform_filters,
+    transform_matrix,
 )
+from i2i.nn.c4_spectral_constants import is_supported
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
 
@@ -131,9 +132,28 @@ def test_turning_the_maps_turns_the_result() -> None:
 def test_kept_blocks_give_the_same_result() -> None:
     torch.manual_seed(7)
     base, x = torch.randn(2, 8, 3, 3), torch.randn(3, 8, 8, 8)
-    blocks = transform_filters(base, 8)
-    assert blocks.shape == (41, 8, 8)
-    assert torch.equal(spectral_product(x, blocks, kernel_size=3), spectral_conv2d_base(x, base))
+    matrix = transform_matrix(8, 3, dtype=torch.float32)
+    blocks = transform_filters(base.view(2, 2, 36), matrix)
+    assert blocks.shape == (21, 8, 8)
+    kept = from_pixel_major(spectral_product(to_pixel_major(x), blocks, kernel_size=3))
+    assert torch.equal(kept, spectral_conv2d_base(x, base))
+    with pytest.raises(ValueError, match="do not fit maps"):
+        spectral_product(torch.randn(81, 4, 2, 3), blocks, kernel_size=3)
+
+
+def test_four_frequencies_share_a_block() -> None:
+    """The number of products: 4 (N² − 1) + 4 rows of an image per pair of fields and pixel."""
+    blocks = transform_filters(torch.randn(1, 1, 36), transform_matrix(8, 3, dtype=torch.float32))
+    products = 4 * 4 * (4 * (len(blocks) - 1) + 1)
+    assert products / 64 == 20.25
+
+
+def test_pixel_major_is_undone() -> None:
+    x = torch.randn(3, 20, 5, 5)
+    assert to_pixel_major(x).shape == (25, 4, 5, 3)
+    # Channel = field * 4 + turn.
+    assert to_pixel_major(x)[7, 2, 3, 1] == x[1, 14, 1, 2]
+    assert torch.equal(from_pixel_major(to_pixel_major(x)), x)
 
 
 def test_training_after_inference_mode() -> None:
@@ -198,40 +218,4 @@ def test_supported_sizes_are_those_of_the_dense_layer() -> None:
     assert not is_supported(8, 3, 2)
     assert not is_supported(8, 4)
     assert not is_supported(3, 5)
-    assert not is_supported(64, 3)
-
-
-def test_preference_needs_work_enough() -> None:
-    assert prefers_spectral(64, 64, map_size=8, batch=64)
-    assert prefers_spectral(64, 64, map_size=8, batch=16, cached=True)
-    assert not prefers_spectral(64, 64, map_size=8, batch=16)
-    assert not prefers_spectral(64, 64, map_size=8, batch=1, cached=True)
-    assert not prefers_spectral(2, 2, map_size=8, batch=64)
-    assert not prefers_spectral(64, 64, map_size=16, batch=64)
-    assert not prefers_spectral(64, 64, map_size=8, batch=64, dtype=torch.bfloat16)
-    assert not prefers_spectral(64, 64, map_size=8, batch=64, kernel_size=1)
-
-
-@pytest.mark.parametrize(
-    ("maps", "filters", "message"),
-    [
-        ((1, 8, 8, 7), (2, 8, 3, 3), "square maps"),
-        ((1, 4, 8, 8), (2, 8, 3, 3), "square maps"),
-        ((1, 6, 8, 8), (2, 6, 3, 3), "multiple of 4"),
-        ((1, 8, 8, 8), (2, 8, 4, 4), "No spectral form"),
-        ((1, 8, 32, 32), (2, 8, 3, 3), "conv2d"),
-    ],
-)
-def test_refuses_what_it_cannot_do(
-    maps: tuple[int, ...], filters: tuple[int, ...], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        spectral_conv2d_base(torch.zeros(maps), torch.zeros(filters))
-
-
-def test_refuses_blocks_of_another_map_size_and_unexpanded_kernels() -> None:
-    blocks = transform_filters(torch.zeros(2, 8, 3, 3), 8)
-    with pytest.raises(ValueError, match="map_size=16"):
-        spectral_product(torch.zeros(1, 8, 16, 16), blocks, kernel_size=3)
-    with pytest.raises(ValueError, match="spectral_conv2d_base"):
-        spectral_conv2d(torch.zeros(1, 8, 8, 8), torch.zeros(2, 8, 3, 3))
+    assert not is_supported(32, 3)

@@ -9,14 +9,22 @@ mode.
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from i2i.nn.c4_spectral import is_supported, prefers_spectral, spectral_conv2d
+from i2i.nn.c4_basis import TURNS, full_basis, symmetrise
+from i2i.nn.c4_dispatch import is_traced
+from i2i.nn.c4_spectral import (
+    product_dtype,
+    spectral_conv_pixel_major,
+    spectral_product,
+    transform_filters,
+    transform_matrix,
+)
 from i2i.nn.precision import full_precision
 
 with warnings.catch_warnings():
@@ -25,7 +33,6 @@ with warnings.catch_warnings():
     from escnn import gspaces
     from escnn.nn import FieldType, R2Conv
 
-TURNS = 4
 BASES = ("band_limited", "full")
 
 # Kernels of even size have no centre cell: rings at the radii of the four inner and of the twelve
@@ -67,34 +74,6 @@ def _describe(field_type: FieldType) -> tuple[str, int]:
 def _build_type(description: tuple[str, int]) -> FieldType:
     kind, num_fields = description
     return trivial_type(num_fields) if kind == "trivial" else regular_type(num_fields)
-
-
-def _full_basis(in_kind: str, out_kind: str, kernel_size: int) -> Tensor:
-    """All kernels that commute with quarter turns, one free weight per cell: (K, out, in, S).
-
-    `kernel[s, j] = rot90^s(kernel[0, j − s])`: the filters of a plain group convolution.
-    """
-    cells = kernel_size**2
-    deltas = torch.eye(cells).view(cells, kernel_size, kernel_size)
-    out_turns = TURNS if out_kind == "regular" else 1
-    in_turns = TURNS if in_kind == "regular" else 1
-    basis = torch.zeros(in_turns, cells, out_turns, in_turns, cells)
-    for shift in range(in_turns):
-        for turn in range(out_turns):
-            turned = torch.rot90(deltas, turn, dims=(1, 2)).reshape(cells, cells)
-            basis[shift, :, turn, (shift + turn) % in_turns] = turned
-    return basis.flatten(0, 1)
-
-
-def _symmetrise(basis: Tensor, in_kind: str, out_kind: str) -> Tensor:
-    """The kernels (K, out, in, S) without rounding noise: entries that a turn relates become equal.
-
-    escnn samples its harmonics in float32; left as they are, a network in float64 would be
-    equivariant to 1e-7 only.
-    """
-    orbits = _full_basis(in_kind, out_kind, math.isqrt(basis.shape[-1])).flatten(1).double()
-    means = basis.detach().flatten(1).double() @ orbits.T / orbits.sum(dim=1)
-    return (means @ orbits).view(basis.shape).to(basis.dtype)
 
 
 class C4Conv(R2Conv):
@@ -161,22 +140,23 @@ class C4Conv(R2Conv):
             **rings,
         )
         if basis == "full":
-            kernel_basis = _full_basis(in_kind, out_kind, kernel_size)
+            kernel_basis = full_basis(in_kind, out_kind, kernel_size)
         else:
             # escnn hands the same tensor to every layer: a copy keeps `.double()` or `.cuda()` of
             # one network from changing another.
-            kernel_basis = _symmetrise(next(self._basisexpansion.buffers()), in_kind, out_kind)
+            kernel_basis = symmetrise(next(self._basisexpansion.buffers()), in_kind, out_kind)
         bias_column = (
             self.bias_expansion[: out_type.size // out_fields, 0].clone() if bias else None
         )
         self._strip_escnn_state()
         self.basis = basis
         self.in_fields, self.out_fields = in_fields, out_fields
-        self.is_regular = in_kind == out_kind == "regular"
         self.register_buffer("kernel_basis", kernel_basis, persistent=False)
         self.register_buffer("bias_scale", bias_column, persistent=False)
         self.weights = nn.Parameter(torch.empty(out_fields * in_fields * kernel_basis.shape[0]))
-        self._cache: tuple[Tensor, Tensor] | None = None
+        # A snapshot of the weights and what was computed from it, by key.
+        self._cache: tuple[Tensor, dict[object, Tensor]] | None = None
+        self._matrices: dict[object, Tensor] = {}
         self.reset_parameters()
 
     def _strip_escnn_state(self) -> None:
@@ -209,44 +189,78 @@ class C4Conv(R2Conv):
 
     def _kernel(self) -> Tensor:
         """The expanded kernel, from the cache where that is safe."""
+        return self._cached("dense", lambda: self.expand_parameters()[0])
+
+    def _cached(self, key: object, make: Callable[[], Tensor]) -> Tensor:
+        """What `make` computes from the weights, kept in evaluation for as long as they last."""
         weights = self.weights
         needs_grad = torch.is_grad_enabled() and weights.requires_grad
         # On a GPU comparing would wait for the device and expanding is cheap: no cache there.
-        if self.training or needs_grad or weights.device.type != "cpu" or _is_traced():
+        if self.training or needs_grad or weights.device.type != "cpu" or is_traced():
             self._cache = None
-            return self.expand_parameters()[0]
+            return make()
         # Compared by value: an optimiser, an average or `weights.data.copy_()` that goes around
         # every version counter is seen as well.
-        if self._cache is None or not _same(self._cache[0], weights):
-            with torch.inference_mode(mode=False), torch.no_grad():
-                snapshot = weights.detach().clone()
-                self._cache = (snapshot, self.expand_parameters()[0])
-        return self._cache[1]
+        with torch.inference_mode(mode=False), torch.no_grad():
+            if self._cache is None or not _same(self._cache[0], weights):
+                self._cache = (weights.detach().clone(), {})
+            kept = self._cache[1]
+            if key not in kept:
+                kept[key] = make()
+        return kept[key]
 
-    def _convolve(self, x: Tensor, kernel: Tensor) -> Tensor:
-        """The convolution proper, without the bias; spectral where that is faster."""
-        if self._is_spectral(x):
-            return spectral_conv2d(x, kernel)
-        return nn.functional.conv2d(x, kernel, stride=self.stride, padding=self.padding)
+    def _spectral_matrix(self, map_size: int) -> Tensor:
+        """From the weights of a pair of fields to its spectral blocks (16 (n + 1), K)."""
+        basis = self.kernel_basis
+        key = (map_size, basis.dtype, basis.device)
+        if key not in self._matrices:
+            with torch.inference_mode(mode=False), torch.no_grad(), full_precision(basis):
+                taps = transform_matrix(map_size, self.kernel_size, dtype=torch.float64)
+                rows = basis[:, 0].flatten(1).double().cpu()  # (K, 4 · cells): K[0, j]
+                self._matrices[key] = (taps @ rows.T).to(basis)
+        return self._matrices[key]
 
-    def _is_spectral(self, x: Tensor) -> bool:
-        """Whether the spectral form applies here, and pays (docs/c4_spectral.md)."""
-        square = x.shape[-1] == x.shape[-2]
-        if not (self.training and self.is_regular and square) or _is_traced():
-            return False
-        if x.device.type != "cpu" or self.padding != self.kernel_size // 2:
-            return False
-        if not is_supported(x.shape[-1], self.kernel_size, self.stride):
-            return False
-        dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
-        return prefers_spectral(
-            self.in_fields,
-            self.out_fields,
-            map_size=x.shape[-1],
-            batch=len(x),
-            dtype=dtype,
-            kernel_size=self.kernel_size,
-        )
+    def pixel_major(self, x: Tensor) -> Tensor:
+        """The same convolution on pixel-major maps: 1×1 as it is, others through the spectrum.
+
+        Only for regular fields, odd kernels, stride 1 and padding k // 2: see `c4_spectral`.
+
+        Shape:
+            (H · H, 4, in_fields, B) -> (H · H, 4, out_fields, B).
+        """
+        out = self._pointwise(x) if self.kernel_size == 1 else self._spectral(x)
+        if self.bias is None:
+            return out
+        return out + (self.bias_scale[:, None] * self.bias)[..., None]  # (4, out_fields, 1)
+
+    def _pointwise(self, x: Tensor) -> Tensor:
+        """A 1×1 convolution as two products, of x_g + x_{g+2} and of x_g − x_{g+2}."""
+        pixels, _, _, batch = x.shape
+        kernel = self._kernel().view(self.out_fields, TURNS, self.in_fields, TURNS)
+        first, second = kernel[:, :2].permute(1, 0, 3, 2).unflatten(2, (2, 2)).unbind(2)
+        halves = x.view(pixels, 2, -1, batch)
+        mixed = []
+        for sign in (1, -1):
+            weights = (first + sign * second).reshape(2 * self.out_fields, -1)
+            columns = halves[:, 0] + sign * halves[:, 1]
+            columns = columns.transpose(0, 1).reshape(2 * self.in_fields, -1)
+            # Half of the sum and of the difference of the two results.
+            mixed.append((0.5 * weights @ columns).view(-1, pixels, batch).to(x.dtype))
+        out = torch.stack([mixed[0] + mixed[1], mixed[0] - mixed[1]])  # (2, 2 · fields, P, B)
+        # The batch norm that follows wants it contiguous.
+        return out.permute(2, 0, 1, 3).reshape(pixels, TURNS, self.out_fields, batch).contiguous()
+
+    def _spectral(self, x: Tensor) -> Tensor:
+        matrix = self._spectral_matrix(math.isqrt(len(x)))
+        coefficients = self.weights.view(self.out_fields, self.in_fields, -1)
+        if torch.is_grad_enabled() and (self.weights.requires_grad or x.requires_grad):
+            return spectral_conv_pixel_major(x, coefficients, matrix, kernel_size=self.kernel_size)
+        dtype = product_dtype(x)
+        with full_precision(x):
+            blocks = self._cached(
+                (len(x), dtype), lambda: transform_filters(coefficients, matrix, dtype=dtype)
+            )
+        return spectral_product(x, blocks, kernel_size=self.kernel_size)
 
     def forward(self, input: Tensor) -> Tensor:
         """Convolve `input` (B, in_type.size, H, W), a plain tensor."""
@@ -255,7 +269,7 @@ class C4Conv(R2Conv):
                 f"expected (B, {self.in_type.size}, H, W) for {self.in_fields} fields, "
                 f"got {tuple(input.shape)}"
             )
-        out = self._convolve(input, self._kernel())
+        out = nn.functional.conv2d(input, self._kernel(), stride=self.stride, padding=self.padding)
         if self.bias is None:
             return out
         bias = (self.bias[:, None] * self.bias_scale).flatten()
@@ -306,7 +320,7 @@ class C4Conv(R2Conv):
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles: no cache, and escnn's types (not picklable) by description."""
         state = self.__dict__.copy()
-        state["_cache"] = None
+        state["_cache"], state["_matrices"] = None, {}
         state["in_type"], state["out_type"] = _describe(self.in_type), _describe(self.out_type)
         # Closures and a group that only construction needs.
         for name in ("space", "_maximum_frequency", "_rings", "_sigma"):
@@ -338,10 +352,6 @@ def _same(snapshot: Tensor, weights: Tensor) -> bool:
     )
 
 
-def _is_traced() -> bool:
-    return torch.compiler.is_compiling() or torch.jit.is_tracing()
-
-
 class C4BatchNorm(nn.BatchNorm2d):
     """Batch norm with one affine pair per regular field, statistics pooled over the four turns.
 
@@ -360,6 +370,16 @@ class C4BatchNorm(nn.BatchNorm2d):
         # batch norm is much less accurate in float32: rows are made contiguous where they are not.
         rows = input.reshape(batch, channels // TURNS, TURNS * height, width)
         return super().forward(rows).view(batch, channels, height, width)
+
+    def pixel_major(
+        self, x: Tensor, *, shortcut: Tensor | None = None, relu: bool = False
+    ) -> Tensor:
+        """The same on pixel-major maps (pixels, 4, num_fields, B), then add and clip in place."""
+        out = super().forward(x.view(-1, *x.shape[2:], 1))
+        if shortcut is not None:
+            out = out.add_(shortcut.view(out.shape))
+        # Before the view: autograd would copy around an operation in place on one.
+        return (torch.relu_(out) if relu else out).view(x.shape)
 
 
 def group_max_pool(x: Tensor) -> Tensor:

@@ -5,13 +5,11 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from i2i.nn.c4 import (
-    C4BatchNorm,
-    C4Conv,
-    group_max_pool,
-    regular_type,
-    trivial_type,
-)
+from i2i.nn.c4 import C4BatchNorm, C4Conv, group_max_pool, regular_type, trivial_type
+from i2i.nn.c4_dispatch import takes_product, takes_spectral
+from i2i.nn.c4_stem import stem_map
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
+from i2i.nn.precision import at_least_float32
 
 STEM_MODES = ("ref", "odd", "k4", "pool")
 _BLOCKS_PER_LAYER = 2
@@ -97,7 +95,31 @@ class C4BasicBlock(nn.Module):
         self.conv2 = make(out_fields, out_fields, 3, stride=1)
         self.norm2 = C4BatchNorm(out_fields)
         self.shortcut = _shortcut(in_fields, out_fields, stride=stride, stem_mode=stem_mode)
-        self.dead_conv2 = dead_conv2
+        self.out_fields, self.dead_conv2 = out_fields, dead_conv2
+
+    def enter_pixel_major(self, x: Tensor) -> Tensor:
+        """(B, 4 · in_fields, H, W) -> (P, 4, out_fields, B), P cells of the map that comes out."""
+        out = to_pixel_major(at_least_float32(self.conv1(x)))
+        return self._finish(out, to_pixel_major(at_least_float32(self.shortcut(x))))
+
+    def pixel_major(self, x: Tensor) -> Tensor:
+        """(P, 4, in_fields, B) -> (P, 4, out_fields, B), of a block without a stride."""
+        shortcut = x
+        if isinstance(self.shortcut, nn.Sequential):
+            conv, norm = self.shortcut
+            assert isinstance(conv, C4Conv)
+            assert isinstance(norm, C4BatchNorm)
+            shortcut = norm.pixel_major(conv.pixel_major(x))
+        assert isinstance(self.conv1, C4Conv)
+        return self._finish(self.conv1.pixel_major(x), shortcut)
+
+    def _finish(self, out: Tensor, shortcut: Tensor) -> Tensor:
+        """What follows the first convolution, pixel-major."""
+        out = self.norm1.pixel_major(out, relu=True)
+        if not self.dead_conv2:
+            assert isinstance(self.conv2, C4Conv)
+            out = self.conv2.pixel_major(out)
+        return self.norm2.pixel_major(out, shortcut=shortcut, relu=True)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, 4 · in_fields, H, W) -> (B, 4 · out_fields, H / stride, W / stride)."""
@@ -196,20 +218,53 @@ class C4ResNet18(nn.Module):
                 blocks.append(block)
                 fields = out_fields
         self.blocks = nn.Sequential(*blocks)
+        # From the last stride on all maps have the same size.
+        strided = [layer for layer, stride in enumerate(layer_strides) if stride > 1]
+        self.entry = _BLOCKS_PER_LAYER * max(strided, default=0)
+        self.entry_fields = width * 2 ** max(strided, default=0)
 
     def regular_map(self, image: Tensor) -> Tensor:
         """The map before the maximum over turns: (B, 4 · out_channels, S, S), regular fields."""
+        x = self._stem_map(image)
+        return from_pixel_major(self._pixel_major(x)) if self._is_spectral(x) else self.blocks(x)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, C, H, W) in [0, 1] -> (B, out_channels, S, S)."""
+        x = self._stem_map(image)
+        if not self._is_spectral(x):
+            return group_max_pool(self.blocks(x))
+        x = self._pixel_major(x).amax(dim=1)  # (S · S, out_channels, B)
+        return x.permute(2, 1, 0).reshape(len(image), -1, self.map_size, self.map_size)
+
+    def _stem_map(self, image: Tensor) -> Tensor:
+        """What goes into the blocks: (B, 4 · width, H, W)."""
         expected = (self.in_channels, self.image_size, self.image_size)
         if image.ndim != 4 or image.shape[1:] != expected:
             raise ValueError(f"expected images of shape (B, {expected}), got {tuple(image.shape)}")
         x = (image - self.background) * self.mask
+        if isinstance(self.stem, C4Conv) and takes_product(x):
+            return stem_map(x, self.stem, self.norm, self.max_pool)
         # The maximum commutes with ReLU: pooling first leaves a quarter of the elements to it.
-        x = torch.relu(self.max_pool(self.norm(self.stem(x))))
-        return self.blocks(x)
+        return torch.relu(self.max_pool(self.norm(self.stem(x))))
 
-    def forward(self, image: Tensor) -> Tensor:
-        """(B, C, H, W) in [0, 1] -> (B, out_channels, S, S)."""
-        return group_max_pool(self.regular_map(image))
+    def _is_spectral(self, x: Tensor) -> bool:
+        """Whether the blocks from the last stride on work on pixel-major maps."""
+        return takes_spectral(
+            x,
+            fields=self.entry_fields,
+            map_size=self.map_size,
+            training=torch.is_grad_enabled(),
+        )
+
+    def _pixel_major(self, x: Tensor) -> Tensor:
+        """The blocks: (B, 4 · width, H, W) -> (S · S, 4, out_channels, B)."""
+        for index, block in enumerate(self.blocks):
+            assert isinstance(block, C4BasicBlock)
+            if index < self.entry:
+                x = block(x)
+            else:
+                x = block.enter_pixel_major(x) if index == self.entry else block.pixel_major(x)
+        return x
 
     def extra_repr(self) -> str:
         """`C4: 128×128 -> 304 × 8×8, stem ref`."""

@@ -1,4 +1,4 @@
-"""C4 group convolution in the frequency domain: the same function with about 7x fewer products.
+"""C4 group convolution in the frequency domain: the same function with a seventh of the products.
 
 **What is computed.** A regular-to-regular C4 convolution maps fields x_g(p) to
 
@@ -9,22 +9,25 @@ row K_{0,j} ("base filters") therefore fixes all four. Channel = field * 4 + g, 
 
 **No wrap-around.** The H x H map is padded with zeros to N x N, N the smallest odd number with
 N >= H + k // 2. A cyclic convolution of that length equals the zero-padded one on the map, and
-for odd N zero is the only frequency that equals its negative. Per frequency w,
+for odd N zero is the only frequency that a turn leaves alone. Per frequency w,
 
     Y_h(w) = sum_g A_{h,g}(w) X_g(w),    A_{h,g}(w) = sum_t K_{h,g}(t) exp(i w.t).
 
-**No complex numbers.** Turning twice takes w to -w, and the signals are real; together:
-A_{h+2,g+2} = conj(A_{h,g}). Write s_g = X_g + X_{g+2}, d_g = X_g - X_{g+2} (g = 0, 1) and
-e_g = -i d_g. With P_{h,g} = A_{h,g} + A_{h,g+2} and M_{h,g} = A_{h,g} - A_{h,g+2} one finds
+**One block for four frequencies.** A_{h+1,g+1}(R w) = A_{h,g}(w): numbering the fields one further
+at R w, both frequencies have the same matrix. Two turns take w to -w, where real signals have
+conjugate values, so that A_{h+2,g+2} = conj(A_{h,g}).
+
+**No complex numbers.** Write s_g = X_g + X_{g+2}, d_g = X_g - X_{g+2} (g = 0, 1) and e_g = -i d_g.
+With P_{h,g} = A_{h,g} + A_{h,g+2} and M_{h,g} = A_{h,g} - A_{h,g+2} one finds
 
     | s' |   | Re P   -Im M | | s |
     | e' | = | Im P    Re M | | e |,
 
-a *real* 4 x 4 block per pair of fields. It acts alike on the real and on the imaginary part, so
-one real matrix product per frequency serves both. The (N^2 - 1) / 2 pairs {w, -w} and w = 0 (there
-Im P = Im M = 0 and d itself takes the place of e) make N^2 real rows per field, each costing four
-products per field pair: 4 N^2 / H^2 = 5.06 per pixel and pair of channels' group rows, i.e. 20.25
-per pixel and pair of fields at H = 8, against 16 * 9 = 144 for the direct sum.
+a *real* 4 x 4 block per pair of fields, which acts alike on real and imaginary parts. Each of the
+(N^2 - 1) / 4 orbits {w, Rw, -w, -Rw} is thus one real matrix (4 C_out x 4 C_in) and four columns
+an image: Re and Im at w and at R w. At w = 0, where Im P = Im M = 0 and d itself takes the place
+of e, it is one column. Together 4 N^2 / H^2 = 5.06 products per pixel and pair of channels' group
+rows, i.e. 20.25 per pixel and pair of fields at H = 8, against 16 * 9 = 144 for the direct sum.
 
 **Orthonormal.** Sums and differences, cosines and sines are scaled so that the analysis S has
 orthonormal columns. Synthesis is then its transpose, y = S^T A S x, errors are not amplified, and
@@ -32,99 +35,46 @@ the backward pass consists of the same three pieces: with Z = S dy,
 
     dx = S^T A^T Z,        dA = Z (S x)^T.
 
-**Layout.** The spectrum is (frequency row, (sum/difference, g, field), batch): the analysis is two
-matrix products with constant N^2 x H^2 matrices that write straight into it, the product over
-fields is a batched matrix product on slices of it, and the synthesis reads it in place. The only
-permutations are those of the sums and differences, which move whole maps of H^2 numbers.
+**Layout.** Between layers maps are *pixel-major*: (pixels, 4, fields, batch), see
+`i2i.nn.pixel_major`. Analysis and synthesis are then products of small constant matrices with whole
+rows of all fields and images. What they write is put together by orbit, so that each block meets
+its four columns of all images in one product.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
+from i2i.nn.c4_spectral_constants import (
+    MAX_MAP_SIZE,
+    Constants,
+    constants,
+    is_supported,
+    padded_size,
+)
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
+
 __all__ = [
     "base_filters",
     "is_supported",
-    "prefers_spectral",
+    "product_dtype",
     "spectral_conv2d",
     "spectral_conv2d_base",
+    "spectral_conv_pixel_major",
     "spectral_product",
     "transform_filters",
+    "transform_matrix",
 ]
 
 _ORDER = 4  # of the group
-_MAX_MAP_SIZE = 17  # the transform is a dense N^2 x H^2 matrix: pointless beyond such maps
-
-
-def is_supported(map_size: int, kernel_size: int, stride: int = 1) -> bool:
-    """Tell whether the spectral form computes this convolution.
-
-    Args:
-        map_size: H of the square H x H map, in cells.
-        kernel_size: k of the k x k kernel; the padding is k // 2.
-        stride: Stride of the convolution.
-
-    Returns:
-        True for stride 1, odd k that is not larger than the map, and 2 <= H <= 17.
-    """
-    return (
-        stride == 1
-        and kernel_size % 2 == 1
-        and kernel_size <= map_size
-        and 2 <= map_size <= _MAX_MAP_SIZE
-    )
-
-
-def prefers_spectral(
-    c_in: int,
-    c_out: int,
-    *,
-    map_size: int,
-    batch: int,
-    dtype: torch.dtype = torch.float32,
-    kernel_size: int = 3,
-    cached: bool = False,
-) -> bool:
-    """Tell where the spectral form was measured to be faster than the dense one on a CPU.
-
-    The rule is cautious: it says yes only where the gain stood out from the noise of repeated runs
-    (see docs/c4_spectral.md). Transforming the filters costs as much as some twenty images,
-    whatever the number of fields; the dense transforms of 16 x 16 maps cost more than they save;
-    in bfloat16 with matrix units (AMX) runs contradicted each other.
-
-    Args:
-        c_in: Input fields (channels / 4).
-        c_out: Output fields.
-        map_size: H of the H x H map.
-        batch: Number of images.
-        dtype: What the products run in (the autocast dtype under autocast).
-        kernel_size: k of the k x k kernel.
-        cached: The transformed filters are at hand (evaluation), so their cost does not count.
-
-    Returns:
-        True if the spectral form is supported and expected to be faster.
-    """
-    return (
-        is_supported(map_size, kernel_size)
-        and kernel_size >= 3
-        and map_size in (8, 9)
-        and dtype in (torch.float32, torch.float64)
-        and min(c_in, c_out) >= 16
-        and c_in * c_out >= 1024
-        and batch >= (16 if cached else 32)
-    )
-
-
-def padded_size(map_size: int, kernel_size: int) -> int:
-    """Return N, the smallest odd length that keeps a k x k kernel from wrapping round."""
-    length = map_size + kernel_size // 2
-    return length if length % 2 == 1 else length + 1
+# Of fields x images: all non-zero orbits (n, 4 C, 4 B), columns (Re, Im at R w; Re, Im at w), and
+# w = 0 (4 C, B). What goes into the blocks has rows (sum|difference, slot, field), what comes out
+# (field, sum|difference, slot): so the blocks are written in order, see transform_filters.
+_Spectrum = tuple[Tensor, Tensor]
 
 
 def base_filters(kernel: Tensor) -> Tensor:
@@ -139,187 +89,246 @@ def base_filters(kernel: Tensor) -> Tensor:
     return kernel[::_ORDER]
 
 
-@dataclass(frozen=True)
-class _Constants:
-    """Constant matrices for one map size and kernel size.
+def _turns(half: int, slot: int) -> tuple[tuple[int, int, float], tuple[int, int, float]]:
+    """(turn, g, sign): what a slot of the spectrum holds at R w and at w.
 
-    Attributes:
-        analysis: Shape (2, N^2, H^2): the transform of the sums and that of the differences. Rows:
-            real parts of the pairs {w, -w}, then w = 0, then imaginary parts.
-        filters: Shape ((pairs + 1) * 16, 4 * k^2): from the base filters (j, tap) of a field pair
-            to its real blocks (frequency, s'|e', h, s|e, g).
+    At R w the fields are numbered one further: slot 0 holds g = 1, and slot 1 holds g = 2, which
+    is g = 0 again, with the opposite sign for differences.
     """
-
-    analysis: Tensor
-    filters: Tensor
+    return (1, 1 - slot, -1.0 if half and slot else 1.0), (0, slot, 1.0)
 
 
-@functools.lru_cache(maxsize=32)
-@torch.inference_mode(mode=False)  # kept for later training steps, whoever asks first
-def _constants(
-    map_size: int, kernel_size: int, dtype: torch.dtype, device: torch.device
-) -> _Constants:
-    """Build the constant matrices in float64 and cast them."""
-    size = padded_size(map_size, kernel_size)
-    # One of w and -w; zero, its own negative, comes last.
-    pairs = [
-        (a, b) for a in range(size) for b in range(size) if (a, b) > ((-a) % size, (-b) % size)
-    ]
-    omega = torch.tensor([*pairs, (0, 0)], dtype=torch.float64) * (2.0 * math.pi / size)
+def _part(spectrum: _Spectrum, half: int, slot: int, *, fields_first: bool) -> _Spectrum:
+    """Views of one slot of a spectrum: (n, C, 4, B) and (C, B)."""
+    fields = spectrum[1].shape[0] // _ORDER
+    batch = spectrum[1].shape[1]
+    if fields_first:
+        main = spectrum[0].view(-1, fields, 2, 2, _ORDER, batch)[:, :, half, slot]
+        return main, spectrum[1].view(fields, 2, 2, batch)[:, half, slot]
+    main = spectrum[0].view(-1, 2, 2, fields, _ORDER, batch)[:, half, slot]
+    return main, spectrum[1].view(2, 2, fields, batch)[half, slot]
 
-    cells = torch.arange(map_size, dtype=torch.float64)
-    phase = omega @ torch.cartesian_prod(cells, cells).T  # (pairs + 1, H^2)
-    cosine, sine = phase.cos(), phase.sin()
-    # X(w) = sum_p x(p) exp(-i w.p); 1/sqrt(2) per sum or difference; sqrt(2) for the pairs.
-    scale = 1.0 / size
-    zero = cosine[-1:] * (scale / math.sqrt(2.0))
-    real, imaginary = cosine[:-1] * scale, -sine[:-1] * scale
-    analysis = torch.stack(
-        [
-            torch.cat([real, zero, imaginary]),  # s = (Re, Im)
-            torch.cat([imaginary, zero, -real]),  # e = -i d = (Im, -Re)
-        ]
+
+def _analyse(
+    x: Tensor, matrices: Constants, dtype: torch.dtype, *, fields_first: bool = False
+) -> _Spectrum:
+    """Apply S to maps (H^2, 4, C, B), in ``dtype``."""
+    pixels, _, fields, batch = x.shape
+    halves = x.view(pixels, 2, 2, fields * batch)
+    mixed = x.new_empty(pixels, 2, 2, fields * batch, dtype=dtype)
+    torch.add(halves[:, 0], halves[:, 1], out=mixed[:, 0])
+    torch.sub(halves[:, 0], halves[:, 1], out=mixed[:, 1])
+    orbits = matrices.orbits
+    spectrum = (
+        mixed.new_empty(orbits, _ORDER * fields, _ORDER * batch),
+        mixed.new_empty(_ORDER * fields, batch),
     )
-
-    offset = torch.arange(kernel_size, dtype=torch.float64) - kernel_size // 2
-    tap = torch.cartesian_prod(offset, offset)  # (k^2, 2), (row, column)
-    filters = omega.new_zeros(len(omega), 2, 2, 2, 2, _ORDER, len(tap))
-    for h in range(2):  # A_{h,g}(w) = sum_t K_{0,g-h}(t) exp(i w . R^h t)
-        angle = omega @ tap.T  # (pairs + 1, k^2)
-        for g in range(2):
-            for j, sign in (((g - h) % _ORDER, 1.0), ((g + 2 - h) % _ORDER, -1.0)):
-                filters[:, 0, h, 0, g, j] = angle.cos()  # Re P
-                filters[:, 0, h, 1, g, j] = -sign * angle.sin()  # -Im M
-                filters[:, 1, h, 0, g, j] = angle.sin()  # Im P
-                filters[:, 1, h, 1, g, j] = sign * angle.cos()  # Re M
-        tap = torch.stack([-tap[:, 1], tap[:, 0]], dim=1)
-    filters = filters.view(-1, _ORDER * len(tap))
-    return _Constants(analysis.to(device, dtype), filters.to(device, dtype))
+    rows = mixed.new_empty(_ORDER * orbits + 1, fields * batch)
+    parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
+    for half in range(2):
+        for slot in range(2):
+            for turn, g, sign in _turns(half, slot):
+                torch.mm(sign * matrices.analysis[half][turn], mixed[:, half, g], out=parts[turn])
+            main, zero = _part(spectrum, half, slot, fields_first=fields_first)
+            main.copy_(rows[:-1].view(_ORDER, orbits, fields, batch).permute(1, 2, 0, 3))
+            zero.copy_(rows[-1].view(fields, batch))
+    return spectrum
 
 
-def _analyse(x: Tensor, analysis: Tensor) -> Tensor:
-    """Apply S: maps (B, C * 4, H, W) to the spectrum (N^2, 4 * C, B), rows (s|e, g, field)."""
-    batch, channels = x.shape[:2]
-    fields, pixels = channels // _ORDER, x.shape[2] * x.shape[3]
-    halves = x.reshape(batch, fields, 2, 2, pixels).permute(2, 3, 1, 0, 4)  # (g // 2, g % 2, C, B)
-    mixed = x.new_empty(2, 2, fields, batch, pixels)
-    torch.add(halves[0], halves[1], out=mixed[0])
-    torch.sub(halves[0], halves[1], out=mixed[1])
-    spectrum = x.new_empty(analysis.shape[1], 2, 2 * fields * batch)
-    torch.bmm(analysis, mixed.view(2, -1, pixels).mT, out=spectrum.transpose(0, 1))
-    return spectrum.view(-1, channels, batch)
+def _synthesise(
+    spectrum: _Spectrum, matrices: Constants, like: Tensor, *, fields_first: bool = False
+) -> Tensor:
+    """Apply S^T: a spectrum to maps (H^2, 4, C, B) in the dtype and batch size of ``like``."""
+    pixels, batch = like.shape[0], like.shape[3]
+    orbits, fields = matrices.orbits, spectrum[1].shape[0] // _ORDER
+    mixed = spectrum[0].new_empty(pixels, 2, 2, fields * batch)
+    rows = mixed.new_empty(_ORDER * orbits + 1, fields * batch)
+    parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
+    for half in range(2):
+        for slot in range(2):
+            main, zero = _part(spectrum, half, slot, fields_first=fields_first)
+            rows[:-1].view(_ORDER, orbits, fields, batch).copy_(main.permute(2, 0, 1, 3))
+            rows[-1].view(fields, batch).copy_(zero)
+            for turn, g, sign in _turns(half, slot):
+                matrix, sums = matrices.analysis[half][turn].mT, mixed[:, half, g]
+                # The first slot writes both parities, the second adds to both.
+                if slot == 0:
+                    torch.mm(sign * matrix, parts[turn], out=sums)
+                else:
+                    sums.addmm_(matrix, parts[turn], alpha=sign)
+    y = like.new_empty(pixels, 2, 2, fields * batch)
+    torch.add(mixed[:, 0], mixed[:, 1], out=y[:, 0])
+    torch.sub(mixed[:, 0], mixed[:, 1], out=y[:, 1])
+    return y.view(pixels, _ORDER, fields, batch)
 
 
-def _synthesise(spectrum: Tensor, analysis: Tensor, map_size: int) -> Tensor:
-    """Apply S^T: the spectrum (N^2, 4 * C, B) to maps (B, C * 4, H, H), contiguous."""
-    rows, channels, batch = spectrum.shape
-    fields, pixels = channels // _ORDER, map_size * map_size
-    spectrum = spectrum.view(rows, 2, -1)
-    mixed = torch.bmm(spectrum.permute(1, 2, 0), analysis).view(2, 2, fields, batch, pixels)
-    y = spectrum.new_empty(batch, fields, 2, 2, pixels)
-    halves = y.permute(2, 3, 1, 0, 4)
-    torch.add(mixed[0], mixed[1], out=halves[0])
-    torch.sub(mixed[0], mixed[1], out=halves[1])
-    return y.view(batch, channels, map_size, map_size)
+def _multiply(blocks: Tensor, spectrum: _Spectrum) -> _Spectrum:
+    """Multiply the blocks (n + 1, M, K) with a spectrum."""
+    return torch.bmm(blocks[:-1], spectrum[0]), torch.mm(blocks[-1], spectrum[1])
 
 
-def _multiply(blocks: Tensor, spectrum: Tensor) -> Tensor:
-    """Multiply blocks (F, M, K) with a spectrum (2 F - 1, K, B): real and imaginary parts."""
-    count = blocks.shape[0]
-    product = spectrum.new_empty(spectrum.shape[0], blocks.shape[1], spectrum.shape[2])
-    torch.bmm(blocks, spectrum[:count], out=product[:count])
-    torch.bmm(blocks[:-1], spectrum[count:], out=product[count:])
-    return product
+def _coefficient_gradient(upstream: _Spectrum, spectrum: _Spectrum, matrix: Tensor) -> Tensor:
+    """dL/d(coefficients), (C_out, C_in, K), one orbit after the other: dA is never whole."""
+    out_size, in_size = len(upstream[1]), len(spectrum[1])
+    out_fields, in_fields = out_size // _ORDER, in_size // _ORDER
+    total = matrix.new_zeros(out_fields, matrix.shape[1], in_fields)
+    block = upstream[1].new_empty(out_size, in_size)
+    columns = zip((*upstream[0], upstream[1]), (*spectrum[0], spectrum[1]), strict=True)
+    for part, (left, right) in zip(matrix.split(_ORDER**2), columns, strict=True):
+        torch.mm(left, right.mT, out=block)
+        pairs = block.view(out_fields, _ORDER**2, in_fields).to(matrix.dtype)
+        total.baddbmm_(part.mT.expand(out_fields, -1, -1), pairs)
+    return total.mT.contiguous()
 
 
-def _correlate(left: Tensor, right: Tensor) -> Tensor:
-    """Sum left @ right^T over batch and over real and imaginary parts: (F, M, K)."""
-    count = (left.shape[0] + 1) // 2
-    total = torch.bmm(left[:count], right[:count].mT)
-    total[:-1].baddbmm_(left[count:], right[count:].mT)
-    return total
-
-
-class _SpectralProduct(torch.autograd.Function):
-    """y = S^T A S x; the products run in the dtype of ``blocks``, the transforms in x's."""
+class _SpectralConv(torch.autograd.Function):
+    """y = S^T A S x with A = transform_filters(coefficients, matrix), in the dtype ``dtype``."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, x: Tensor, blocks: Tensor, kernel_size: int) -> Tensor:
-        analysis = _constants(x.shape[2], kernel_size, x.dtype, x.device).analysis
-        spectrum = _analyse(x, analysis).to(blocks.dtype)
-        ctx.save_for_backward(spectrum, blocks)
-        ctx.analysis, ctx.map_size = analysis, x.shape[2]  # type: ignore[attr-defined]
-        return _synthesise(_multiply(blocks, spectrum).to(x.dtype), analysis, x.shape[2])
+    def forward(
+        ctx: FunctionCtx,
+        x: Tensor,
+        coefficients: Tensor,
+        matrix: Tensor,
+        kernel_size: int,
+        dtype: torch.dtype,
+    ) -> Tensor:
+        blocks = transform_filters(coefficients, matrix, dtype=dtype)
+        y, spectrum = _apply(x, blocks, kernel_size)
+        ctx.save_for_backward(*spectrum, blocks, matrix)
+        ctx.kernel_size = kernel_size  # type: ignore[attr-defined]
+        return y
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        spectrum, blocks = ctx.saved_tensors  # type: ignore[attr-defined]
-        analysis: Tensor = ctx.analysis  # type: ignore[attr-defined]
-        upstream = _analyse(grad.to(analysis.dtype), analysis).to(blocks.dtype)
-        need_x, need_blocks, _ = ctx.needs_input_grad  # type: ignore[attr-defined]
-        grad_x = grad_blocks = None
+    def backward(
+        ctx: FunctionCtx, grad: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        main, zero, blocks, matrix = ctx.saved_tensors  # type: ignore[attr-defined]
+        grad = grad.contiguous()
+        matrices = constants(
+            math.isqrt(len(grad)),
+            ctx.kernel_size,  # type: ignore[attr-defined]
+            blocks.dtype,
+            grad.device,
+        )
+        upstream = _analyse(grad, matrices, blocks.dtype, fields_first=True)
+        need_x, need_coefficients = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
+        grad_x = grad_coefficients = None
+        if need_coefficients:
+            grad_coefficients = _coefficient_gradient(upstream, (main, zero), matrix)
         if need_x:
-            product = _multiply(blocks.mT, upstream).to(analysis.dtype)
-            grad_x = _synthesise(product, analysis, ctx.map_size)  # type: ignore[attr-defined]
-        if need_blocks:
-            grad_blocks = _correlate(upstream, spectrum)
-        return grad_x, grad_blocks, None
+            grad_x = _synthesise(_multiply(blocks.mT, upstream), matrices, grad)
+        return grad_x, grad_coefficients, None, None, None
 
 
-def transform_filters(base: Tensor, map_size: int) -> Tensor:
-    """Transform base filters to the real blocks that :func:`spectral_product` multiplies with.
+def _apply(x: Tensor, blocks: Tensor, kernel_size: int) -> tuple[Tensor, _Spectrum]:
+    """S^T A S x and the spectrum S x."""
+    matrices = constants(math.isqrt(len(x)), kernel_size, blocks.dtype, x.device)
+    spectrum = _analyse(x, matrices, blocks.dtype)
+    product = _multiply(blocks, spectrum)
+    return _synthesise(product, matrices, x, fields_first=True), spectrum
 
-    In evaluation mode the result can be kept for as long as the filters do not change; it has
-    2 (N^2 + 1) / k^2 times the memory of ``base`` (18x for 3 x 3 filters on 8 x 8 maps).
+
+def transform_matrix(
+    map_size: int, kernel_size: int, *, dtype: torch.dtype, device: torch.device | str = "cpu"
+) -> Tensor:
+    """The matrix from base filters to blocks, for :func:`transform_filters`.
+
+    A layer whose filters are ``weights @ basis`` multiplies it with ``basis`` once and passes its
+    weights as the coefficients.
 
     Args:
-        base: Filters K[0, j] of the first group row, shape (C_out, C_in * 4, k, k), channel =
-            field * 4 + j.
-        map_size: H of the H x H maps that will be convolved.
+        map_size: H of the H x H maps.
+        kernel_size: k of the k x k kernel.
+        dtype: Of the coefficients.
+        device: Of the coefficients.
 
     Returns:
-        Blocks, shape ((N^2 + 1) / 2, 4 * C_out, 4 * C_in), in the dtype of ``base``.
+        Shape (16 * ((N^2 - 1) / 4 + 1), 4 * k^2); columns (j, row, column) of K[0, j].
     """
-    out_fields, channels, kernel_size = base.shape[:3]
-    matrix = _constants(map_size, kernel_size, base.dtype, base.device).filters
-    with torch.autocast(base.device.type, enabled=False):
-        # (frequency * s'|e' * h * s|e * g, C_out * C_in): then only runs of C_in numbers move.
-        blocks = matrix @ base.reshape(-1, matrix.shape[1]).t()
-        blocks = blocks.view(-1, _ORDER, _ORDER, out_fields, channels // _ORDER)
-        return blocks.transpose(2, 3).reshape(-1, _ORDER * out_fields, channels)
+    return constants(map_size, kernel_size, dtype, torch.device(device)).filters
+
+
+def transform_filters(
+    coefficients: Tensor, matrix: Tensor, *, dtype: torch.dtype | None = None
+) -> Tensor:
+    """Transform filters to the real blocks that :func:`spectral_product` multiplies with.
+
+    In evaluation mode the result can be kept for as long as the filters do not change; it has
+    4 (N^2 + 3) / k^2 times the memory of the base filters (about 9x for 3 x 3 on 8 x 8 maps).
+
+    Args:
+        coefficients: Shape (C_out, C_in, K): of each pair of fields.
+        matrix: Result of :func:`transform_matrix`, or its product with a basis (4 * k^2, K).
+        dtype: Of the result; that of ``coefficients`` by default.
+
+    Returns:
+        Blocks, shape ((N^2 - 1) / 4 + 1, 4 * C_out, 4 * C_in), w = 0 last; rows (field, s'|e', h),
+        columns (s|e, g, field).
+    """
+    out_fields, in_fields = coefficients.shape[:2]
+    columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
+    parts = matrix.split(_ORDER**2)
+    blocks = columns.new_empty(
+        len(parts), out_fields, _ORDER**2, in_fields, dtype=dtype or columns.dtype
+    )
+    rounded = blocks.dtype != columns.dtype
+    pairs = columns.new_empty(blocks.shape[1:])
+    for part, block in zip(parts, blocks, strict=True):
+        # One orbit at a time: if it has to be rounded, it is still in the cache.
+        out = pairs if rounded else block
+        torch.bmm(part.expand(out_fields, -1, -1), columns, out=out)
+        if rounded:
+            block.copy_(pairs)
+    return blocks.view(len(parts), _ORDER * out_fields, _ORDER * in_fields)
+
+
+def spectral_conv_pixel_major(
+    x: Tensor, coefficients: Tensor, matrix: Tensor, *, kernel_size: int
+) -> Tensor:
+    """Convolve pixel-major maps; differentiable once in maps and coefficients.
+
+    Under autocast everything between the sums and differences of the maps runs in the lower
+    precision; the result has the dtype of ``x``.
+
+    Args:
+        x: Maps, shape (H * H, 4, C_in, B), contiguous, see `to_pixel_major`.
+        coefficients: Shape (C_out, C_in, K), see :func:`transform_filters`.
+        matrix: See :func:`transform_filters`.
+        kernel_size: k of the filters.
+
+    Returns:
+        Maps, shape (H * H, 4, C_out, B).
+    """
+    dtype = product_dtype(x)
+    with torch.autocast(x.device.type, enabled=False):
+        return _SpectralConv.apply(x, coefficients, matrix, kernel_size, dtype)
 
 
 def spectral_product(x: Tensor, blocks: Tensor, *, kernel_size: int) -> Tensor:
-    """Convolve maps with transformed filters.
-
-    Under autocast, or with ``blocks`` of a lower precision, only the products over the fields run
-    in the lower precision; the transforms stay in the precision of ``x``.
+    """Convolve pixel-major maps with transformed filters that are kept; not differentiable.
 
     Args:
-        x: Maps, shape (B, C_in * 4, H, H), channel = field * 4 + g.
-        blocks: Result of :func:`transform_filters` for this H.
+        x: Maps, shape (H * H, 4, C_in, B), contiguous.
+        blocks: Result of :func:`transform_filters` for this H; the products run in its dtype.
         kernel_size: k of the filters that ``blocks`` was made from.
 
     Returns:
-        Maps, shape (B, C_out * 4, H, H), contiguous, in the dtype of ``x``. Differentiable once.
+        Maps, shape (H * H, 4, C_out, B), in the dtype of ``x``.
 
     Raises:
-        ValueError: if the shapes do not fit together or the convolution is not supported.
+        ValueError: if the blocks are those of another map or kernel size.
     """
-    _check(x, blocks.shape[2], kernel_size)
-    count = (padded_size(x.shape[2], kernel_size) ** 2 + 1) // 2
-    if blocks.shape[0] != count:
+    count = (padded_size(math.isqrt(len(x)), kernel_size) ** 2 + 3) // 4
+    if blocks.shape[0] != count or blocks.shape[2] != _ORDER * x.shape[2]:
         raise ValueError(
-            f"The filters were transformed for {blocks.shape[0]} frequencies, but a "
-            f"{x.shape[2]}x{x.shape[3]} map with a {kernel_size}x{kernel_size} kernel has {count}: "
-            f"call transform_filters(base, map_size={x.shape[2]})."
+            f"The blocks {tuple(blocks.shape)} do not fit maps {tuple(x.shape)} and a "
+            f"{kernel_size}x{kernel_size} kernel, which take ({count}, *, {_ORDER * x.shape[2]}): "
+            "call transform_filters with the transform_matrix of this map size."
         )
-    device = x.device.type
-    if torch.is_autocast_enabled(device) and blocks.dtype != torch.float64:
-        blocks = blocks.to(torch.get_autocast_dtype(device))
-    with torch.autocast(device, enabled=False):
-        return _SpectralProduct.apply(x, blocks, kernel_size)
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        return _apply(x, blocks, kernel_size)[0]
 
 
 def spectral_conv2d_base(x: Tensor, base: Tensor) -> Tensor:
@@ -337,8 +346,12 @@ def spectral_conv2d_base(x: Tensor, base: Tensor) -> Tensor:
         ValueError: if the shapes do not fit together or the convolution is not supported.
     """
     _check(x, base.shape[1], base.shape[-1])
-    blocks = transform_filters(base, x.shape[2])
-    return spectral_product(x, blocks, kernel_size=base.shape[-1])
+    matrix = transform_matrix(x.shape[2], base.shape[-1], dtype=base.dtype, device=base.device)
+    coefficients = base.reshape(len(base), base.shape[1] // _ORDER, matrix.shape[1])
+    y = spectral_conv_pixel_major(
+        to_pixel_major(x), coefficients, matrix, kernel_size=base.shape[-1]
+    )
+    return from_pixel_major(y)
 
 
 def spectral_conv2d(x: Tensor, kernel: Tensor) -> Tensor:
@@ -366,6 +379,14 @@ def spectral_conv2d(x: Tensor, kernel: Tensor) -> Tensor:
     return spectral_conv2d_base(x, base_filters(kernel))
 
 
+def product_dtype(x: Tensor) -> torch.dtype:
+    """What the products run in: the autocast dtype under autocast, double precision excepted."""
+    device = x.device.type
+    if torch.is_autocast_enabled(device) and x.dtype != torch.float64:
+        return torch.get_autocast_dtype(device)
+    return x.dtype
+
+
 def _check(x: Tensor, channels: int, kernel_size: int) -> None:
     """Raise a ValueError that names the shapes unless the convolution is supported."""
     if x.ndim != 4 or x.shape[2] != x.shape[3] or x.shape[1] != channels or channels % _ORDER:
@@ -377,5 +398,5 @@ def _check(x: Tensor, channels: int, kernel_size: int) -> None:
         raise ValueError(
             f"No spectral form for a {kernel_size}x{kernel_size} kernel on a {x.shape[2]}x"
             f"{x.shape[2]} map: allowed are odd kernels not larger than the map and maps of 2 to "
-            f"{_MAX_MAP_SIZE} cells. Use torch.nn.functional.conv2d."
+            f"{MAX_MAP_SIZE} cells. Use torch.nn.functional.conv2d."
         )

@@ -1,0 +1,87 @@
+"""Which form a C4 convolution takes: dense or spectral (docs/c4_spectral.md).
+
+Both compute the same function. `"auto"` takes the faster by what was measured; the others force
+one, for comparisons and for tools that look at the layers from outside.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from i2i.nn.c4_spectral import is_supported
+
+MODES = ("auto", "dense", "spectral")
+_MODE = ["auto"]
+
+# Images below which transforming costs more than it saves (benchmarks/c4_spectral.py): in training
+# the filters are transformed at every step, in evaluation once.
+_LEAST_BATCH_TRAINING = 16
+_LEAST_BATCH_CACHED = 8
+_LEAST_FIELDS = 16
+_LARGEST_MAP = 9  # 16 × 16 maps: the dense transforms cost what the products save
+
+
+def set_convolution_mode(mode: str) -> None:
+    """Choose for this process.
+
+    Raises:
+        ValueError: If the mode is unknown.
+    """
+    if mode not in MODES:
+        raise ValueError(f"convolution={mode!r} is not known: choose one of {', '.join(MODES)}")
+    _MODE[0] = mode
+
+
+@contextmanager
+def convolution_mode(mode: str) -> Iterator[None]:
+    """Choose for a while.
+
+    Raises:
+        ValueError: If the mode is unknown.
+
+    Example:
+        >>> with convolution_mode("dense"):
+        ...     pass
+    """
+    before = _MODE[0]
+    set_convolution_mode(mode)
+    try:
+        yield
+    finally:
+        _MODE[0] = before
+
+
+def is_traced() -> bool:
+    """Whether a compiler or tracer is watching, which cannot follow the spectral form."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()
+
+
+def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> bool:
+    """Whether 3×3 convolutions of stride 1 on such maps go through the spectrum.
+
+    Args:
+        x: A tensor on the device of the maps, batch first.
+        fields: The smaller of the numbers of regular fields in and out.
+        map_size: Side of the square maps.
+        training: Whether gradients are wanted, so that the filters change at every step.
+    """
+    if _MODE[0] == "dense" or is_traced() or not is_supported(map_size, 3):
+        return False
+    if _MODE[0] == "spectral":
+        return True
+    least = _LEAST_BATCH_TRAINING if training else _LEAST_BATCH_CACHED
+    return (
+        x.device.type == "cpu"
+        and map_size <= _LARGEST_MAP
+        and fields >= _LEAST_FIELDS
+        and len(x) >= least
+    )
+
+
+def takes_product(image: Tensor) -> bool:
+    """Whether the first convolution is a product with patches (`i2i.nn.c4_stem`)."""
+    if _MODE[0] == "dense" or is_traced() or image.requires_grad:
+        return False
+    return _MODE[0] == "spectral" or image.device.type == "cpu"
