@@ -107,21 +107,18 @@ def test_change_of_mesh_camera_and_size_is_noticed(embree, wedge, sphere, rotati
     np.testing.assert_array_equal(embree.render(wedge, rotations), first)
 
 
-def test_culling_misses_nothing(wedge, rotations, monkeypatch):
-    """Against casting every ray of the picture, also with the camera inside the object's reach."""
-    from i2i.rendering.raygrid import RayGrid
-
-    far_spike = RenderMesh(
-        vertices=np.concatenate([wedge.vertices, [[0, 0, 5.0], [0.1, 0, 5.0], [0, 0.1, 0.2]]]),
-        faces=np.concatenate([wedge.faces, len(wedge.vertices) + np.arange(3)[None]]),
-        face_material=np.zeros(len(wedge.faces) + 1, dtype=np.int64),
-    )
-    for mesh in (wedge, far_spike):
-        culled = EmbreeRenderer().depth(mesh, rotations)
-        with monkeypatch.context() as patch:
-            patch.setattr(RayGrid, "around", lambda self, points: np.arange(self.image_size**2))
-            everything = EmbreeRenderer().depth(mesh, rotations)
-        np.testing.assert_array_equal(culled, everything)
+@pytest.mark.parametrize("image_size", [24, 64, 128])
+def test_pictures_do_not_depend_on_how_many_are_drawn_together(
+    wedge, rotations, monkeypatch, image_size
+):
+    settings = [(modality, image_size) for modality in ("gray", "depth", "rgb")]
+    together = [
+        EmbreeRenderer().render(wedge, rotations, modality=m, image_size=s) for m, s in settings
+    ]
+    monkeypatch.setattr("i2i.rendering.embree._PIXELS_AT_ONCE", 1)
+    for (modality, size), expected in zip(settings, together, strict=True):
+        alone = EmbreeRenderer().render(wedge, rotations, modality=modality, image_size=size)
+        np.testing.assert_array_equal(alone, expected)
 
 
 def test_antialiasing_only_touches_edges(wedge, rotations):

@@ -50,7 +50,7 @@ def test_reflection_is_the_metallic_roughness_model(cosine, albedo):
     arguments = np.array([cosine], np.float32), np.array([2.7], np.float32)
     gray = reflected_light(*arguments, albedo=albedo, intensity=GRAY_LIGHT)
     assert gray[0] == pytest.approx(expected, rel=1e-4)
-    colors = np.array([[albedo, 1.0, 0.0]], np.float32)
+    colors = np.array([[albedo], [1.0], [0.0]], np.float32)
     rgb = reflected_light(*arguments, albedo=colors, intensity=GRAY_LIGHT)
     assert rgb[0, 0] == pytest.approx(expected, rel=1e-4)
 

@@ -79,10 +79,13 @@ def shift_depth(images: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     Returns:
         ``images``.
     """
-    background = images >= 1.0
-    images += offsets.astype(np.float32)[:, None, None, None]
-    np.clip(images, 0.0, 1.0, out=images)
-    np.putmask(images, background, np.float32(1.0))
+    for image, offset in zip(images, offsets.astype(np.float32), strict=True):
+        # Image by image, all steps stay in the processor's cache. No value may fall below its
+        # floor: 1 for the background, 0 for the surface.
+        floor = (image >= 1.0).astype(np.float32)
+        image += offset
+        np.maximum(image, floor, out=image)
+        np.minimum(image, np.float32(1.0), out=image)
     return images
 
 

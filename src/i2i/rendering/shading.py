@@ -29,6 +29,7 @@ CREASE_ANGLE_DEG = 40.0
 
 # Depth pictures: ray lengths from (camera distance - 1) to (camera distance + 1), the unit sphere.
 DEPTH_HALF_RANGE = 1.0
+_BLOCK = 2**16  # pixels whose intermediate values stay in the processor's cache
 
 
 def linear_from_srgb(value: ArrayLike) -> NDArray[np.float64]:
@@ -58,15 +59,15 @@ def reflected_light(
         cosine: Cosine between the normal and the direction to the camera, shape (N,); negative
             where a blended normal points away.
         distance: Ray length, shape (N,).
-        albedo: Linear base colour: a number, or shape (N, 3).
+        albedo: Linear base colour: a number, or shape (3, N).
         intensity: Of the point light at the camera, falling off with the squared distance.
 
     Returns:
-        Linear light before clipping: shape (N,) for a number, (N, 3) for colours.
+        Linear light before clipping: shape (N,) for a number, (3, N) for colours.
     """
-    lit = np.clip(cosine, _MIN_COSINE, 1.0)
-    seen = np.clip(np.abs(cosine), _MIN_COSINE, 1.0)
-    facing = np.clip(cosine, 0.0, 1.0)
+    lit = _between(cosine, _MIN_COSINE)
+    seen = _between(np.abs(cosine), _MIN_COSINE)
+    facing = _between(cosine, 0.0)
     alpha2 = np.float32(ROUGHNESS**4)
     spread = facing * facing * (alpha2 - 1) + 1
     distribution = alpha2 / (np.float32(np.pi) * spread * spread)
@@ -80,15 +81,21 @@ def reflected_light(
     diffuse = np.asarray(albedo, np.float32) * np.float32(
         (1 - DIELECTRIC_REFLECTANCE) * (1 - METALLIC) / np.pi
     )
-    if fresnel.ndim == 2:
-        specular, radiance = specular[:, None], radiance[:, None]
     light: NDArray[np.float32] = radiance * ((1 - fresnel) * diffuse + fresnel * specular)
     return light
 
 
+def _between(value: NDArray[np.float32], low: float) -> NDArray[np.float32]:
+    """`value` from `low` to 1; numpy's own clip is slower on short arrays."""
+    result: NDArray[np.float32] = np.maximum(value, np.float32(low))
+    return np.minimum(result, np.float32(1.0), out=result)
+
+
 def display_value(light: NDArray[np.float32]) -> NDArray[np.float32]:
     """Values of a picture from linear light, same shape, in [0, 255], not rounded: clip, gamma."""
-    value: NDArray[np.float32] = np.clip(light, 0.0, 1.0) ** np.float32(1 / DISPLAY_GAMMA) * 255
+    value = _between(light, 0.0)
+    value **= np.float32(1 / DISPLAY_GAMMA)
+    value *= 255
     return value
 
 
@@ -101,9 +108,17 @@ def encode_depth(depth: NDArray[np.float32], *, distance: float) -> NDArray[np.u
         depth: Ray lengths, any shape; 0 is background.
         distance: Distance of the camera from the origin.
     """
-    unit = (distance + DEPTH_HALF_RANGE - depth) / (2 * DEPTH_HALF_RANGE)
-    value = np.clip(np.rint(unit * 255), 0, 255).astype(np.uint8)
-    value[depth <= 0] = BACKGROUND
+    value = np.empty(depth.shape, dtype=np.uint8)
+    flat, flat_value = np.ravel(depth), value.reshape(-1)
+    for start in range(0, flat.size, _BLOCK):
+        part = flat[start : start + _BLOCK]
+        unit = (distance + DEPTH_HALF_RANGE) - part
+        unit /= 2 * DEPTH_HALF_RANGE
+        unit *= 255
+        np.rint(unit, out=unit)
+        np.clip(unit, 0, 255, out=unit)
+        unit[part <= 0] = BACKGROUND
+        flat_value[start : start + _BLOCK] = unit
     return value
 
 
