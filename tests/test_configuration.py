@@ -41,6 +41,7 @@ def test_every_option_of_a_group_composes(group):
         ("predict", []),
         ("download", ["data=modelnet40"]),
         ("check", []),
+        ("export", []),
         ("report", ["table=1"]),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "i2i"
 SHARED = {"errors", "i2i"}  # may be imported by everybody
-DOORS = {"train", "evaluate", "predict", "render", "download", "report", "check"}
+DOORS = {"train", "evaluate", "predict", "render", "download", "report", "check", "export"}
 ALLOWED = {
     "geometry": set(),
     "nn": {"geometry"},

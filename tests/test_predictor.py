@@ -13,6 +13,7 @@ from torch import nn
 from i2i.data.info import DataInfo
 from i2i.errors import CheckpointError, ConfigurationError, ImageError
 from i2i.models.prediction import ClassPrediction, PosePrediction
+from i2i.prediction_results import ClassResult
 from i2i.predictor import Predictor
 from i2i.rendering.mesh import prepare_mesh
 from i2i.rendering.reference import save_mesh
@@ -57,6 +58,14 @@ class FakeRegressor(nn.Module):
 class FakeClassifier(nn.Module):
     def forward(self, batch):
         return ClassPrediction(logits=torch.tensor([[0.0, 2.0]]), descriptor=torch.zeros(1, 2))
+
+
+class FakeRows(nn.Module):
+    """A classifier of any number of pictures."""
+
+    def forward(self, batch):
+        logits = torch.zeros(len(batch["image"]), 2)
+        return ClassPrediction(logits=logits, descriptor=logits)
 
 
 @pytest.fixture
@@ -209,3 +218,78 @@ def test_diverged_network_and_bad_picture(pose, tmp_path):
     pose.candidates = pose.candidates * float("nan")
     with pytest.raises(CheckpointError, match="not a finite number"):
         Predictor(pose, INFO).predict(np.full((32, 32), 255, np.uint8))
+
+
+def test_many_pictures_are_answered_in_their_order_as_one_by_one(tmp_path):
+    """A network whose answer depends on the picture; the last batch is not full."""
+
+    class Brightness(nn.Module):
+        def forward(self, batch):
+            sizes.append(len(batch["image"]))
+            mean = batch["image"].mean(dim=(1, 2, 3))
+            logits = torch.stack([torch.zeros_like(mean), 5 * mean], dim=1)
+            return ClassPrediction(logits=logits, descriptor=logits)
+
+    sizes: list[int] = []
+    predictor = Predictor(Brightness(), JOINT)
+    pictures = [np.full((32, 32), level, np.uint8) for level in range(0, 250, 25)]
+    many = [r.probabilities["stool"] for r in predictor.predict_many(pictures, batch_size=4)]
+    assert sizes == [4, 4, 2]
+    one_by_one = [predictor.predict(picture).probabilities["stool"] for picture in pictures]
+    assert many == pytest.approx(one_by_one, abs=1e-6)
+    assert many == sorted(many)
+    assert many[0] < many[-1]
+
+
+def test_candidates_of_each_picture_stay_with_it():
+    class Turning(nn.Module):
+        """One candidate a picture, turned by its brightness."""
+
+        def forward(self, batch):
+            degrees = (90 * batch["image"].mean(dim=(1, 2, 3))).tolist()
+            found = torch.tensor(np.stack([turned(about="z", by_deg=d) for d in degrees])).float()
+            other = found @ torch.tensor(turned(about="x", by_deg=90.0)).float()
+            mass = torch.tensor([0.75, 0.25]).log().expand(len(found), 2)
+            return PosePrediction(found, log_prob=mass, candidates=torch.stack([found, other], 1))
+
+    pictures = [np.full((32, 32), level, np.uint8) for level in (0, 85, 170, 255)]
+    results = list(Predictor(Turning(), INFO).predict_many(pictures))
+    for degrees, result in zip((0, 30, 60, 90), results, strict=True):
+        expected = turned(about="z", by_deg=degrees)
+        np.testing.assert_allclose(result.rotation, expected, atol=1e-5)
+        np.testing.assert_allclose(
+            result.alternatives[0].rotation, expected @ turned(about="x", by_deg=90.0), atol=1e-5
+        )
+        assert result.confidence == pytest.approx(0.75, abs=1e-6)
+
+
+def test_a_bad_picture_is_told_in_its_turn(tmp_path):
+    pictures = [np.full((32, 32), 255, np.uint8), np.zeros((32, 32), np.uint8), tmp_path / "no.png"]
+    answered = []
+    with pytest.raises(ImageError, match=r"no\.png"):
+        answered.extend(Predictor(FakeRows(), JOINT).predict_many(pictures))
+    stream = Predictor(FakeRows(), JOINT).predict_many(pictures)
+    assert [type(next(stream)), type(next(stream))] == [ClassResult, ClassResult]
+    with pytest.raises(ImageError, match=r"no\.png"):
+        next(stream)
+
+
+def test_pictures_are_taken_no_more_than_two_batches_ahead():
+    """A folder of any size fits into memory."""
+    taken = 0
+
+    def endless():
+        nonlocal taken
+        while True:
+            taken += 1
+            yield np.full((32, 32), 255, np.uint8)
+
+    stream = Predictor(FakeRows(), JOINT).predict_many(endless(), batch_size=4)
+    for number in range(1, 20):
+        next(stream)
+        assert taken <= number + 2 * 4
+
+
+def test_batches_of_nothing_are_refused():
+    with pytest.raises(ConfigurationError, match="batch_size=0"):
+        next(Predictor(FakeRows(), JOINT).predict_many([], batch_size=0))

@@ -53,13 +53,14 @@ def test_the_installed_package_composes_and_shows_its_help(installed):
         "import i2i.configuration as c; print(c.config_dir()); "
         "print(c.plain(c.compose(['data=shapenet_bed']))['scale']['name']); "
         "words = {'download': ['data=modelnet40']}; "
-        "doors = ('train', 'evaluate', 'predict', 'render', 'download', 'report', 'check'); "
+        "doors = ('train', 'evaluate', 'predict', 'render', 'download', 'report', 'check', "
+        "'export'); "
         "print(sum(len(c.compose(words.get(door, []), door)) > 0 for door in doors)); "
         "groups = {'data': 'data=', 'model': 'model=', 'scale': 'scale=', 'task': 'task='}; "
         "print(all(c.compose([word + p.stem]) for g, word in groups.items() "
         "for p in sorted((__import__('pathlib').Path(c.config_dir()) / g).glob('*.yaml'))))",
     ).split()
-    assert printed == [str(installed / "i2i" / "conf"), "paper", "7", "True"]
+    assert printed == [str(installed / "i2i" / "conf"), "paper", "8", "True"]
     text = run(installed, "from i2i.train import main; main()", "--help")
     assert "model=i2i task=pose data=shapenet_bed" in text
     assert "shapenet55" in text

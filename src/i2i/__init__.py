@@ -3,13 +3,17 @@
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load"]
+__all__ = ["__version__", "export_run", "load"]
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever the attribute is
-    """Import `load` when it is first asked for: rendering processes never pay for torch."""
+    """Import what is asked for when it is first: rendering processes never pay for torch."""
     if name == "load":
         from i2i.predictor import load
 
         return load
+    if name == "export_run":
+        from i2i.exporting import export_run
+
+        return export_run
     raise AttributeError(f"module 'i2i' has no attribute {name!r}")

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from i2i.data.info import DataInfo
-from i2i.data.photographs import prepare_photograph
 from i2i.data.pictures import Picture
-from i2i.data.point_files import Cloud, prepare_cloud
+from i2i.data.point_files import Cloud
 from i2i.errors import CheckpointError, ConfigurationError
-from i2i.geometry.cameras import Camera
 from i2i.geometry.rotations import euler_deg_from_rotation, quaternion_xyzw_from_rotation
 from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.models.prediction import PosePrediction
+from i2i.network_input import Seen, ahead, see
+from i2i.nn.folding import fold
 from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.reference import load_mesh
@@ -31,16 +29,6 @@ SAME_ANSWER_DEG = 15.0
 """Candidates closer than this to a better one count as the same answer; their mass is added up."""
 
 _NUM_ALTERNATIVES = 3
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """What the network gets (without the class), and what was done to it."""
-
-    batch: dict[str, Tensor]
-    crop_box: tuple[float, float, float, float] | None
-    warnings: tuple[str, ...]
-    camera_from_crop: np.ndarray
 
 
 class Predictor:
@@ -144,62 +132,86 @@ class Predictor:
         """
         if class_name is not None:
             self._check_class(class_name)
-        if self.info.num_points is not None:
-            crop = {"mask": mask, "box": box, "intrinsics": intrinsics}
-            seen = self._see_cloud(image, axes, **crop, margin=None if margin == 1 else margin)
-        elif axes != "opengl":
+        seen = see(
+            image, self.info, mask=mask, box=box, intrinsics=intrinsics, margin=margin, axes=axes
+        )
+        return next(self._answer([seen], class_name))
+
+    def predict_many(
+        self,
+        images: Iterable[Picture | Cloud],
+        *,
+        class_name: str | None = None,
+        batch_size: int = 16,
+        workers: int = 2,
+        **how: Any,  # noqa: ANN401 - passed on as they are
+    ) -> Iterator[PoseResult | ClassResult]:
+        """Answer for many pictures or clouds, in their order, while the next ones are read.
+
+        No more than two batches are held at a time, so `images` may be a generator.
+
+        Args:
+            images: Pictures or clouds, see `predict`.
+            class_name: Class of all of them, see `predict`.
+            batch_size: How many go through the network at once.
+            workers: Threads that read and crop.
+            **how: `mask`, `box`, `intrinsics`, `margin` and `axes` of `predict`, for all.
+
+        Yields:
+            What `predict` gives. A picture that cannot be read raises when its turn comes, after
+            the answers for those before it.
+
+        Raises:
+            ConfigurationError: as `predict`, or if a number is below 1.
+            ImageError: as `predict`.
+            CheckpointError: as `predict`.
+        """
+        if batch_size < 1 or workers < 1:
             raise ConfigurationError(
-                f"axes={axes} is for clouds, and this network sees {self.info.modality}: leave it "
-                "out"
+                f"batch_size={batch_size} and workers={workers} must be at least 1"
             )
-        else:
-            seen = self._see_picture(image, mask, box, intrinsics, margin)
-        batch = {name: tensor.to(self.device) for name, tensor in seen.batch.items()}
-        chosen = class_name or self.info.class_names[0]
-        batch["class_id"] = torch.tensor([self.info.class_names.index(chosen)], device=self.device)
+        if class_name is not None:
+            self._check_class(class_name)
+        seen: list[Seen] = []
+        prepare = partial(see, info=self.info, **how)
+        # One batch is read while the network is busy with another.
+        prepared = ahead(prepare, images, workers=workers, count=batch_size)
+        for future in prepared:
+            if future.exception() is not None:
+                yield from self._answer(seen, class_name)
+                seen = []
+            seen.append(future.result())
+            if len(seen) == batch_size:
+                yield from self._answer(seen, class_name)
+                seen = []
+        yield from self._answer(seen, class_name)
+
+    def _answer(
+        self, seen: list[Seen], class_name: str | None
+    ) -> Iterator[PoseResult | ClassResult]:
+        """One batch through the network."""
+        if not seen:
+            return
+        names = self.info.class_names
+        batch = {
+            name: torch.cat([one.batch[name] for one in seen]).to(self.device)
+            for name in seen[0].batch
+        }
+        chosen = class_name or names[0]
+        batch["class_id"] = torch.full((len(seen),), names.index(chosen), device=self.device)
         with torch.inference_mode():
             prediction = self.network(batch)
         if not isinstance(prediction, PosePrediction):
-            return self._class_result(prediction.logits, seen)
+            for row, one in enumerate(seen):
+                yield self._class_result(prediction.logits[row], one)
+            return
         if class_name is None and self.info.num_classes > 1:
             raise ConfigurationError(
                 "This network was trained for several classes and looks at each with its own "
-                f"weights: add class_name=, one of {', '.join(self.info.class_names)}."
+                f"weights: add class_name=, one of {', '.join(names)}."
             )
-        return self._pose_result(prediction, seen, class_name=chosen)
-
-    def _see_picture(
-        self, image: Any, mask: Any, box: Any, intrinsics: Any, margin: float  # noqa: ANN401
-    ) -> _Seen:  # fmt: skip
-        """A picture as an image network wants it."""
-        if self.info.num_views is not None:
-            raise ConfigurationError(
-                f"This network looks at {self.info.num_views} views of one object at once, from "
-                "fixed cameras around it: it cannot answer for a single picture. Use a run with "
-                "data.modality=gray | depth | rgb."
-            )
-        prepared = prepare_photograph(
-            image, channels=self.info.channels, image_size=self.info.image_size,
-            background=self.info.background, mask=mask, box=box, intrinsics=intrinsics,
-            margin=margin,
-            camera=Camera(distance=self.info.camera_distance, fov_deg=self.info.camera_fov_deg),
-        )  # fmt: skip
-        return _Seen(
-            {"image": prepared.tensor}, prepared.crop_box,
-            (*prepared.warnings, *self._modality_warnings()), prepared.camera_from_crop,
-        )  # fmt: skip
-
-    def _see_cloud(self, cloud: Any, axes: str, **of_pictures: Any) -> _Seen:  # noqa: ANN401
-        """A cloud as a point network wants it."""
-        given = [name for name, value in of_pictures.items() if value is not None]
-        if given:
-            raise ConfigurationError(
-                f"{given[0]}= is for pictures, and this network sees {self.info.modality}: "
-                "give the points of the object alone"
-            )
-        assert self.info.num_points is not None
-        points = prepare_cloud(cloud, num_points=self.info.num_points, axes=axes)
-        return _Seen({"points": points}, None, (), np.eye(3))
+        for row, one in enumerate(seen):
+            yield self._pose_result(_row(prediction, row), one, class_name=chosen)
 
     def _check_class(self, class_name: str) -> None:
         if class_name not in self.info.class_names:
@@ -208,16 +220,8 @@ class Predictor:
                 f"{', '.join(self.info.class_names)}."
             )
 
-    def _modality_warnings(self) -> tuple[str, ...]:
-        if self.info.modality != "depth":
-            return ()
-        return (
-            "The network was trained on depth images (near white, far black, background white), "
-            "not on photographs: give such a depth image.",
-        )
-
     def _pose_result(
-        self, prediction: PosePrediction, seen: _Seen, *, class_name: str
+        self, prediction: PosePrediction, seen: Seen, *, class_name: str
     ) -> PoseResult:
         symmetry = self.info.symmetry[self.info.class_names.index(class_name)]
         best = prediction.rotation[0].double().cpu()
@@ -241,9 +245,10 @@ class Predictor:
             drawing=self._drawing(seen, self.reference_meshes.get(class_name)),
         )
 
-    def _class_result(self, logits: Tensor, seen: _Seen) -> ClassResult:
+    def _class_result(self, logits: Tensor, seen: Seen) -> ClassResult:
+        """The answer for one picture from its logits (C,)."""
         _check_finite(logits)
-        probabilities = torch.softmax(logits[0].double().cpu(), dim=0)
+        probabilities = torch.softmax(logits.double().cpu(), dim=0)
         ranked = torch.argsort(probabilities, descending=True, stable=True).tolist()
         names = self.info.class_names
         return ClassResult(
@@ -255,7 +260,7 @@ class Predictor:
             drawing=self._drawing(seen, None),
         )
 
-    def _drawing(self, seen: _Seen, mesh: RenderMesh | None) -> Drawing:
+    def _drawing(self, seen: Seen, mesh: RenderMesh | None) -> Drawing:
         return Drawing(
             image=input_pictures(seen.batch)[0],
             info=self.info,
@@ -264,13 +269,17 @@ class Predictor:
         )
 
 
-def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> Predictor:
+def load(
+    run: str | Path, *, ckpt: str = "last", device: str = "cpu", optimize: bool = False
+) -> Predictor:
     """Load a trained network for prediction.
 
     Args:
-        run: A run folder, or a checkpoint file.
-        ckpt: `last` or `best`, when a folder is given.
+        run: A run folder, a checkpoint file, or a folder that `python -m i2i.export` wrote.
+        ckpt: `last` or `best`, when a run folder is given.
         device: Where the network goes.
+        optimize: Fold batch norms into plain convolutions (`i2i.nn.folding`): the same answers up
+            to rounding.
 
     Returns:
         A predictor with `.predict(image)`.
@@ -280,11 +289,24 @@ def load(run: str | Path, *, ckpt: str = "last", device: str = "cpu") -> Predict
     """
     folder, path = locate(run, ckpt)
     task = load_task(path)
+    network = fold(task.network) if optimize else task.network
     return Predictor(
-        move_to(task.network, device),
+        move_to(network, device),
         task.info,
         config=task.run_config,
         run_folder=folder.path,
+    )
+
+
+def _row(prediction: PosePrediction, row: int) -> PosePrediction:
+    """What a prediction says about one picture of its batch."""
+    one, candidates, log_prob = slice(row, row + 1), prediction.candidates, prediction.log_prob
+    if candidates is not None and candidates.ndim == 4:  # else all pictures share them
+        candidates = candidates[one]
+    return PosePrediction(
+        rotation=prediction.rotation[one],
+        log_prob=None if log_prob is None else log_prob[one],
+        candidates=candidates,
     )
 
 

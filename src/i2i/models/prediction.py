@@ -46,7 +46,7 @@ class PosePrediction:
         """The best of candidates (B, K, 3, 3) by their logits (B, K), with their softmax."""
         best = logits.argmax(dim=1)
         return cls(
-            rotation=candidates[torch.arange(len(best), device=best.device), best],
+            rotation=candidates[torch.arange(best.shape[0], device=best.device), best],
             logits=logits,
             log_prob=torch.log_softmax(logits, dim=1),
             candidates=candidates,

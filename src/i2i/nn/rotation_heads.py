@@ -219,7 +219,7 @@ class SphericalHead(nn.Module):
             raise ValueError(
                 f"this head serves {self.num_classes} classes: give the index of each image's class"
             )
-        rows = torch.arange(len(output), device=output.device)
+        rows = torch.arange(output.shape[0], device=output.device)
         return output.unflatten(1, (self.num_classes, -1))[rows, class_id]
 
 

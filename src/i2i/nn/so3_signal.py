@@ -322,7 +322,7 @@ def climb(coefficients: Tensor, start: Tensor, lmax: int, *, steps: int = 8) -> 
     wide = torch.float32 if coefficients.device.type == "mps" else torch.float64
     c, rotation = coefficients.to(wide), start.to(wide)
     tangent = generator_table(lmax).to(c)
-    radius = torch.full((len(c),), 0.5 / max(lmax, 1), dtype=wide, device=c.device)
+    radius = torch.full((c.shape[0],), 0.5 / max(lmax, 1), dtype=wide, device=c.device)
     value = values_at(c, rotation, lmax)
     with full_precision(c):
         for _ in range(steps):

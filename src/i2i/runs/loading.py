@@ -11,6 +11,7 @@ from i2i.data.info import DataInfo
 from i2i.errors import CheckpointError, ConfigurationError
 from i2i.runs.building import build_task
 from i2i.runs.folder import RunFolder
+from i2i.runs.weights import WEIGHTS, read_weights
 from i2i.tasks.base import CHECKPOINT_FORMAT, Task
 
 
@@ -31,6 +32,8 @@ def move_to(network: nn.Module, device: str | torch.device) -> nn.Module:
 def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
     """The run folder and the checkpoint file that a user means by `run`.
 
+    A folder that `python -m i2i.export` wrote stands for a run folder with one checkpoint.
+
     Raises:
         CheckpointError: if there is neither.
     """
@@ -43,7 +46,14 @@ def locate(run: str | Path, ckpt: str = "last") -> tuple[RunFolder, Path]:
             f"run={run}: no such run folder or checkpoint; `ls -t runs` shows the newest runs"
         )
     folder = RunFolder(path)
-    return folder, folder.checkpoint(ckpt)
+    exported = path / WEIGHTS
+    if not exported.is_file() or folder.checkpoints.is_dir():
+        return folder, folder.checkpoint(ckpt)
+    if ckpt != "last":
+        raise CheckpointError(
+            f"ckpt={ckpt}: {run} was exported and has one set of weights; leave ckpt out"
+        )
+    return folder, exported
 
 
 def load_task(path: Path) -> Task:
@@ -96,8 +106,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: if it is not one of ours, of another format, or damaged.
     """
+    checkpoint: dict[str, Any]
     try:
-        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        if path.suffix == ".safetensors":
+            checkpoint = read_weights(path)
+        else:
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
