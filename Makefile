@@ -1,5 +1,6 @@
 # make demo   renders chairs, trains I2I on them, evaluates it, draws what it predicts
 # make test   the test suite          make lint   ruff, mypy, yamllint, codespell
+# make bench  all benchmarks, one after the other: on an idle machine
 # make table  the choices inside I2I, from results/ (docs/results.md)
 PYTHON ?= python3
 VENV := .venv
@@ -9,7 +10,7 @@ PIP := $(PY) -m pip --disable-pip-version-check install --quiet
 TORCH_INDEX ?=
 TORCH := $(shell grep '^torch==' requirements.lock)
 
-.PHONY: demo test lint table clean
+.PHONY: demo test lint bench table clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.installed: requirements.lock pyproject.toml
@@ -40,6 +41,10 @@ lint: $(VENV)/.installed-dev
 
 table: $(VENV)/.installed
 	$(PY) -m i2i.runs.results results "consistent labels"
+
+bench: $(VENV)/.installed
+	for name in parameter_counts oracle c4_spectral network_speed training_memory render_rate loader_rate; do \
+		$(PY) benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf $(VENV) build dist

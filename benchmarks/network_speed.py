@@ -1,0 +1,251 @@
+"""The network against the same function made the usual way: steps, inference, head, building.
+
+python benchmarks/network_speed.py                       # all, scale=paper, ten minutes
+python benchmarks/network_speed.py --parts head build    # some
+python benchmarks/network_speed.py --scale small --repeats 9
+
+The peers are escnn's dense layers with correct residual blocks and the direct head (`published`),
+and the encoder's widths in plain torch.nn with our head (`plain`). Variants run alternately in one
+process; what counts are the ratios. Before anything is timed the published peer has to give the
+same answers. Writes `benchmarks/results/<name>.json`, `.md` and `.png`; an earlier JSON of the same
+name is what the new ratios are shown beside.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from alternation import Timing, alternate
+from i2i.configuration import compose
+from i2i.data.noise import noise_batch
+from i2i.memory import reuse_memory
+from i2i.nn.folding import fold
+from i2i.runs.building import build_network, info_of
+from peers import DirectHead, PlainResNet18, escnn_encoder, published
+
+RESULTS = Path(__file__).parent / "results"
+PARTS = ("step", "inference", "head", "build")
+PEER = "published, fp32"
+
+
+def network(scale: str, task: str = "pose", classes: int = 1) -> tuple[nn.Module, Any]:
+    """I2I and what its data would be, always with the same weights."""
+    config = compose(
+        ["model=i2i", f"task={task}", f"scale={scale}", "data=synthetic",
+         "model.encoder.stem_mode=ref"]
+    )  # fmt: skip
+    info = info_of(config, tuple(f"class{i}" for i in range(classes)))
+    torch.manual_seed(0)
+    return build_network(config, info), info
+
+
+def with_plain_encoder(ours: nn.Module) -> nn.Module:
+    """`ours` with the plain encoder, in its place."""
+    ours.trunk.encoder = PlainResNet18(ours.trunk.encoder)
+    return ours
+
+
+def autocast(enabled: bool) -> torch.autocast:
+    """bf16 products, or none."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=enabled)
+
+
+def check_peer(ours: nn.Module, peer: nn.Module, batch: dict[str, Tensor]) -> None:
+    """Both have to be the same function; 40 images, which take the spectral form."""
+    ours.eval(), peer.eval()
+    some = {name: value[:40] for name, value in batch.items()}
+    with torch.no_grad():
+        torch.testing.assert_close(ours(some).logits, peer(some).logits, rtol=1e-3, atol=1e-3)
+
+
+def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
+    """Forward, backward and SGD with momentum."""
+    ours, info = network(scale)
+    batch = noise_batch(info, batch_size)
+    peers = {
+        "published": published(network(scale)[0]),
+        "plain": with_plain_encoder(network(scale)[0]),
+    }
+    check_peer(ours, peers["published"], batch)
+    variants: dict[str, Callable[[], None]] = {}
+    for name, net in {
+        "published": peers["published"],
+        "plain": peers["plain"],
+        "ours": ours,
+    }.items():
+        net.train()
+        optimizer = torch.optim.SGD(net.parameters(), lr=1e-3, momentum=0.9, nesterov=True)
+        for low in (False, True):
+
+            def step(net: nn.Module = net, optimizer: Any = optimizer, low: bool = low) -> None:  # noqa: ANN401
+                with autocast(low):
+                    loss = torch.stack(list(net.loss(net(batch), batch).values())).sum()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+
+            variants[f"{name}, {'bf16' if low else 'fp32'}"] = step
+    return alternate(variants, repeats=repeats)
+
+
+def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
+    """Forward in evaluation mode without gradients."""
+    ours, info = network(scale)
+    batch = noise_batch(info, batch_size)
+    nets = {
+        "published": published(network(scale)[0]),
+        "plain": with_plain_encoder(network(scale)[0]),
+        "ours": ours,
+        "ours folded": fold(ours),
+    }
+    variants: dict[str, Callable[[], None]] = {}
+    for name, net in nets.items():
+        net.eval()
+        for low in (False, True):
+
+            def run(net: nn.Module = net, low: bool = low) -> None:
+                with torch.no_grad(), autocast(low):
+                    net(batch)
+
+            variants[f"{name}, {'bf16' if low else 'fp32'}"] = run
+    return alternate(variants, repeats=repeats, warm_up=2)
+
+
+def heads(task: str, classes: int, repeats: int, batch_size: int) -> dict[str, Timing]:
+    """Projector and group convolution, forward and backward."""
+    net, _ = network("paper", task, classes)
+    trunk = net.trunk
+    direct = DirectHead(trunk.projector, trunk.group_conv)
+    maps = torch.rand(batch_size, 304, 8, 8, requires_grad=True)
+
+    def run(head: Callable[[Tensor], Tensor]) -> None:
+        head(maps).square().sum().backward()
+
+    return alternate(
+        {
+            PEER: lambda: run(direct),
+            "ours, fp32": lambda: run(lambda x: trunk.group_conv(trunk.projector(x), None)),
+        },
+        repeats=repeats,
+    )
+
+
+def building(scale: str) -> dict[str, Timing]:
+    """Making the network once; escnn's own initialisation is what the published one waits for."""
+    start = time.perf_counter()
+    ours, _ = network(scale)
+    middle = time.perf_counter()
+    escnn_encoder(ours.trunk.encoder, initialize=True)
+    end = time.perf_counter()
+    return {
+        PEER: Timing(end - middle, end - middle, end - middle),
+        "ours, fp32": Timing(middle - start, middle - start, middle - start),
+    }
+
+
+def measure(options: argparse.Namespace) -> dict[str, dict[str, Timing]]:
+    """All parts that were asked for, by title."""
+    scale, repeats, size = options.scale, options.repeats, options.batch
+    found: dict[str, dict[str, Timing]] = {}
+    if "step" in options.parts:
+        found[f"training step, batch {size}"] = training_steps(scale, repeats, size)
+    if "inference" in options.parts:
+        for batch in (size, 8, 1):
+            more = repeats if batch > 8 else 4 * repeats
+            found[f"inference, batch {batch}"] = inference(scale, more, batch)
+    if "head" in options.parts:
+        for task, classes, what in (("pose", 1, "7 outputs"), ("classification", 40, "40 classes")):
+            found[f"head forward+backward, {what}"] = heads(task, classes, repeats, size)
+    if "build" in options.parts:
+        found["building"] = building(scale)
+    return found
+
+
+def table(found: dict[str, dict[str, Timing]], before: dict[str, Any]) -> str:
+    """Markdown: milliseconds with quartiles, and how many times faster than the published peer."""
+    lines = ["| | variant | ms [quartiles] | ratio | before |", "|---|---|--:|--:|--:|"]
+    for title, timings in found.items():
+        for name, timing in timings.items():
+            ratio = timings[PEER].median / timing.median
+            old = before.get(title, {}).get(name, {}).get("ratio")
+            earlier = f"{old:.2f}" if old else ""
+            lines.append(f"| {title} | {name} | {timing} | {ratio:.2f} | {earlier} |")
+    return "\n".join(lines)
+
+
+def plot(found: dict[str, dict[str, Timing]], path: Path) -> None:
+    """Bars of the ratios."""
+    from i2i.viz.style import (  # matplotlib only where it is needed
+        new_figure,
+        plain_axes,
+        save_figure,
+    )
+
+    rows = [
+        (f"{title}: {name}", timings[PEER].median / timing.median)
+        for title, timings in found.items()
+        for name, timing in timings.items()
+        if name.startswith("ours")
+    ][::-1]
+    figure = new_figure(7.0, 0.9 + 0.3 * len(rows))
+    axes = figure.add_subplot()
+    plain_axes(axes)
+    axes.barh(range(len(rows)), [ratio for _, ratio in rows])
+    axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+    for place, (_, ratio) in enumerate(rows):
+        axes.annotate(
+            f"{ratio:.1f}×", (ratio, place), xytext=(3, 0), textcoords="offset points", va="center"
+        )
+    axes.set_xscale("log")
+    axes.set_xlabel("times faster than escnn's dense layers and the direct head, fp32")
+    save_figure(figure, path)
+
+
+def main() -> None:
+    """Measure, print, and write the three files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--scale", default="paper")
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--name", default="network_speed")
+    options = parser.parse_args()
+    reuse_memory()
+    torch.set_num_threads(options.threads)
+    file = RESULTS / f"{options.name}.json"
+    before = json.loads(file.read_text())["parts"] if file.is_file() else {}
+    found = measure(options)
+    text = table(found, before)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"{text}\n\n{options.threads} threads, scale={options.scale}")
+    print(f"peak resident memory of all together {peak:.1f} GiB")
+    parts = {
+        title: {
+            name: {"ms": timing.median * 1e3, "ratio": timings[PEER].median / timing.median}
+            for name, timing in timings.items()
+        }
+        for title, timings in found.items()
+    }
+    RESULTS.mkdir(exist_ok=True)
+    machine = {
+        "processor": platform.machine(),
+        "torch": torch.__version__,
+        "threads": options.threads,
+        "capability": torch.backends.cpu.get_cpu_capability(),
+    }
+    file.write_text(json.dumps({"machine": machine, "parts": {**before, **parts}}, indent=1) + "\n")
+    file.with_suffix(".md").write_text(text + "\n")
+    plot(found, file.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()
