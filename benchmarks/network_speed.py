@@ -106,6 +106,7 @@ def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
         "ours": ours,
         "ours folded": fold(ours),
     }
+    check_peer(ours, nets["published"], batch)
     variants: dict[str, Callable[[], None]] = {}
     for name, net in nets.items():
         net.eval()
@@ -120,11 +121,16 @@ def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
 
 
 def heads(task: str, classes: int, repeats: int, batch_size: int) -> dict[str, Timing]:
-    """Projector and group convolution, forward and backward."""
+    """Projector and group convolution at `scale=paper`, forward and backward."""
     net, _ = network("paper", task, classes)
     trunk = net.trunk
     direct = DirectHead(trunk.projector, trunk.group_conv)
     maps = torch.rand(batch_size, 304, 8, 8, requires_grad=True)
+
+    def ours(x: Tensor) -> Tensor:
+        return trunk.group_conv(trunk.projector(x), None)
+
+    torch.testing.assert_close(direct(maps[:2]), ours(maps[:2]), rtol=1e-4, atol=1e-4)
 
     def run(head: Callable[[Tensor], Tensor]) -> None:
         head(maps).square().sum().backward()
@@ -132,7 +138,7 @@ def heads(task: str, classes: int, repeats: int, batch_size: int) -> dict[str, T
     return alternate(
         {
             PEER: lambda: run(direct),
-            "ours, fp32": lambda: run(lambda x: trunk.group_conv(trunk.projector(x), None)),
+            "ours, fp32": lambda: run(ours),
         },
         repeats=repeats,
     )
@@ -217,11 +223,12 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--name", default="network_speed")
+    parser.add_argument("--name", help="of the files; network_speed_<scale>")
     options = parser.parse_args()
     reuse_memory()
     torch.set_num_threads(options.threads)
-    file = RESULTS / f"{options.name}.json"
+    name = options.name or f"network_speed_{options.scale}"
+    file = RESULTS / f"{name}.json"
     before = json.loads(file.read_text())["parts"] if file.is_file() else {}
     found = measure(options)
     text = table(found, before)

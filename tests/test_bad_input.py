@@ -308,6 +308,15 @@ def test_a_run_that_is_running_is_not_resumed(tmp_path):
         other.wait()
 
 
+def test_a_run_from_before_a_setting_existed_is_resumed(tmp_path):
+    train(tiny_run(tmp_path, "trainer.max_steps=2", "run=[fit]"))
+    saved = tmp_path / "run" / "config.yaml"
+    kept = [line for line in saved.read_text().splitlines() if not line.startswith("convolution")]
+    saved.write_text("\n".join(kept) + "\n")
+    train(compose([f"resume={tmp_path}/run"]))
+    assert state(tmp_path) == "done"
+
+
 def test_a_device_that_is_not_there_is_refused():
     if torch.cuda.is_available():
         pytest.skip("it is there")

@@ -13,8 +13,8 @@ def reuse_memory() -> None:
 
     Every activation of a training step is allocated and freed again. By default glibc maps large
     ones anew each time, and the kernel clears them page by page when they are first written: on a
-    20 MB tensor that costs eight times what writing it does. Peak memory is the same. Settings of
-    the user's own (MALLOC_..., THP_MEM_ALLOC_ENABLE) are left alone; without glibc nothing is done.
+    20 MB tensor that costs eight times what writing it does. Settings of the user's own
+    (MALLOC_..., THP_MEM_ALLOC_ENABLE) are left alone; without glibc nothing is done.
     """
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's own switch
     if not sys.platform.startswith("linux") or any(k.startswith("MALLOC_") for k in os.environ):

@@ -29,7 +29,7 @@ from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
 from i2i.errors import ConfigurationError, I2IError, NonFiniteLossError
 from i2i.finishing import finish
-from i2i.nn.c4_dispatch import set_convolution_mode
+from i2i.nn.c4_dispatch import convolution_mode
 from i2i.runs.building import build_datamodule, build_task, follow_root
 from i2i.runs.folder import RunFolder, versions, write_json, write_yaml
 from i2i.runs.identity import config_hash
@@ -46,6 +46,7 @@ log = logging.getLogger(__name__)
 _WITH_RESUME = (
     "resume", "run=", "trainer.accelerator", "trainer.devices", "trainer.strategy",
     "trainer.enable_", "data.root", "data.store_root", "data.num_workers",
+    "convolution",
 )  # fmt: skip
 LOCKS = ".locks"
 """Folder of the jobs' locks, below the folder of the runs."""
@@ -130,7 +131,6 @@ def train_in_sweep(cfg: DictConfig) -> RunResult | None:
 def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
     config = plain(cfg)
     seed_everything(cfg.seed, workers=True, verbose=False)
-    set_convolution_mode(cfg.convolution)
     datamodule = build_datamodule(cfg)
     trainer = _trainer(cfg, folder)
     task = build_task(cfg, datamodule.info)  # what does not fit is told before anything is made
@@ -138,8 +138,9 @@ def _train(cfg: DictConfig, folder: RunFolder, identity: str) -> RunResult:
         _open(folder, config, identity, resumed=bool(cfg.resume))
     try:
         datamodule.prepare_data()
-        _run_stages(cfg, folder, trainer, task, datamodule)
-        metrics = finish(folder, trainer, task, datamodule, config=config, identity=identity)
+        with convolution_mode(cfg.get("convolution", "auto")):  # older runs do not have it
+            _run_stages(cfg, folder, trainer, task, datamodule)
+            metrics = finish(folder, trainer, task, datamodule, config=config, identity=identity)
     except BaseException as error:
         _close_broken(folder, trainer, error)
         raise
@@ -165,7 +166,9 @@ def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
     saved = OmegaConf.create(yaml.safe_load(folder.config.read_text()))
     assert isinstance(saved, DictConfig)
     words = [word.lstrip("+") for word in given_overrides()]
-    typed = OmegaConf.from_dotlist([w for w in words if w.startswith(("trainer.", "data."))])
+    typed = OmegaConf.from_dotlist(
+        [w for w in words if w.startswith(("trainer.", "data.", "convolution="))]
+    )
     merged = OmegaConf.merge(saved, typed, {"resume": cfg.resume, "run": cfg.run})
     assert isinstance(merged, DictConfig)
     merged.run_dir = str(folder.path)

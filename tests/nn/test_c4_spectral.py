@@ -219,3 +219,25 @@ def test_supported_sizes_are_those_of_the_dense_layer() -> None:
     assert not is_supported(8, 4)
     assert not is_supported(3, 5)
     assert not is_supported(32, 3)
+
+
+@pytest.mark.parametrize(
+    ("maps", "filters", "message"),
+    [
+        ((1, 8, 8, 7), (2, 8, 3, 3), "square maps"),
+        ((1, 4, 8, 8), (2, 8, 3, 3), "square maps"),
+        ((1, 6, 8, 8), (2, 6, 3, 3), "multiple of 4"),
+        ((1, 8, 8, 8), (2, 8, 4, 4), "No spectral form"),
+        ((1, 8, 32, 32), (2, 8, 3, 3), "conv2d"),
+    ],
+)
+def test_refuses_what_it_cannot_do(
+    maps: tuple[int, ...], filters: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        spectral_conv2d_base(torch.zeros(maps), torch.zeros(filters))
+
+
+def test_refuses_an_unexpanded_kernel() -> None:
+    with pytest.raises(ValueError, match="spectral_conv2d_base"):
+        spectral_conv2d(torch.zeros(1, 8, 8, 8), torch.zeros(2, 8, 3, 3))

@@ -254,6 +254,7 @@ class C4Conv(R2Conv):
         matrix = self._spectral_matrix(math.isqrt(len(x)))
         coefficients = self.weights.view(self.out_fields, self.in_fields, -1)
         if torch.is_grad_enabled() and (self.weights.requires_grad or x.requires_grad):
+            self._cache = None  # what evaluation kept is many times the weights
             return spectral_conv_pixel_major(x, coefficients, matrix, kernel_size=self.kernel_size)
         dtype = product_dtype(x)
         with full_precision(x):

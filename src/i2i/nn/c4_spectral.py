@@ -256,7 +256,7 @@ def transform_filters(
     """Transform filters to the real blocks that :func:`spectral_product` multiplies with.
 
     In evaluation mode the result can be kept for as long as the filters do not change; it has
-    4 (N^2 + 3) / k^2 times the memory of the base filters (about 9x for 3 x 3 on 8 x 8 maps).
+    (N^2 + 3) / k^2 times the memory of the base filters (9x for 3 x 3 on 8 x 8 maps).
 
     Args:
         coefficients: Shape (C_out, C_in, K): of each pair of fields.
@@ -267,9 +267,8 @@ def transform_filters(
         Blocks, shape ((N^2 - 1) / 4 + 1, 4 * C_out, 4 * C_in), w = 0 last; rows (field, s'|e', h),
         columns (s|e, g, field).
     """
-    out_fields, in_fields = coefficients.shape[:2]
+    (out_fields, in_fields), parts = coefficients.shape[:2], matrix.split(_ORDER**2)
     columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
-    parts = matrix.split(_ORDER**2)
     blocks = columns.new_empty(
         len(parts), out_fields, _ORDER**2, in_fields, dtype=dtype or columns.dtype
     )
@@ -381,9 +380,8 @@ def spectral_conv2d(x: Tensor, kernel: Tensor) -> Tensor:
 
 def product_dtype(x: Tensor) -> torch.dtype:
     """What the products run in: the autocast dtype under autocast, double precision excepted."""
-    device = x.device.type
-    if torch.is_autocast_enabled(device) and x.dtype != torch.float64:
-        return torch.get_autocast_dtype(device)
+    if torch.is_autocast_enabled(x.device.type) and x.dtype != torch.float64:
+        return torch.get_autocast_dtype(x.device.type)
     return x.dtype
 
 

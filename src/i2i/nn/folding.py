@@ -167,7 +167,12 @@ def _is_fixed(norm: nn.Module) -> bool:
 
 
 def _keeps_constants(pool: nn.Module) -> bool:
-    return type(pool) is nn.AvgPool2d and pool.padding == 0 and not pool.ceil_mode
+    return (
+        type(pool) is nn.AvgPool2d
+        and pool.padding == 0
+        and not pool.ceil_mode
+        and pool.divisor_override is None
+    )
 
 
 @torch.no_grad()

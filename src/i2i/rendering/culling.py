@@ -53,17 +53,20 @@ class Culling:
         points = rotations.astype(np.float32) @ self._centers
         ahead = np.float32(self.rays.camera.distance) - points[:, 2]
         nearest = float(ahead.min()) - self._radius
+        everything = np.stack([self._inside] * len(rotations))
         if nearest <= _NEAREST:
-            return np.flatnonzero(np.stack([self._inside] * len(rotations)))
+            return np.flatnonzero(everything)
         sides = points[:, :2] / ahead[:, None]
         # For a point within r of a centre (x, z): |x'/z' - x/z| <= r (1 + |x/z|) / (z - r).
         reach = self._radius * (1 + float(np.abs(sides).max())) / nearest / self.rays.pixel_width
+        if reach > self.rays.image_size:  # marks are kept near the picture: none from so far
+            return np.flatnonzero(everything)
         return np.flatnonzero(self._marked(sides, reach) & self._inside)
 
     def _marked(self, sides: NDArray[np.float32], reach: float) -> NDArray[np.bool_]:
         """Pixels near points of a plane one unit ahead, (N, 2, K); shape (N, S, S)."""
         size = self.rays.image_size
-        grow = min(int(reach + 0.5 + _SLACK), size)  # a half for the mark's own rounding
+        grow = int(reach + 0.5 + _SLACK)  # a half for the mark's own rounding
         # So wide a border that what grows over the end of a row ends in the border of the next.
         border = grow + 1
         side = size + 2 * border
