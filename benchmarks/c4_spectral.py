@@ -2,8 +2,8 @@
 
 Times forward and forward + backward (gradients of the maps and of the filters, filter transform
 included) of ``torch.nn.functional.conv2d`` with the expanded kernel and of
-:func:`i2i.nn.c4_spectral.spectral_conv2d_base`, and prints medians, minima and ratios. The dense
-side starts from the ready expanded kernel, so the cost of expanding it is not counted against it.
+:func:`i2i.nn.c4_spectral.spectral_conv_pixel_major`, each on maps in its own layout, and prints
+medians, minima and ratios. The dense side starts from the ready expanded kernel, so the cost of expanding it is not counted against it.
 
 Example:
     python benchmarks/c4_spectral.py --threads 2 --repeats 15
@@ -22,7 +22,9 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from i2i.nn.c4_spectral import spectral_conv2d_base
+from i2i.memory import reuse_memory
+from i2i.nn.c4_spectral import spectral_conv_pixel_major, transform_matrix
+from i2i.nn.pixel_major import to_pixel_major
 
 
 def expand(base: Tensor) -> Tensor:
@@ -52,18 +54,23 @@ def measure(
     base = torch.randn(fields[1], fields[0] * 4, 3, 3, requires_grad=backward)
     kernel = expand(base.detach()).requires_grad_(backward)
     x = torch.randn(batch, fields[0] * 4, map_size, map_size, requires_grad=backward)
-    upstream = torch.randn(batch, fields[1] * 4, map_size, map_size)
+    maps = to_pixel_major(x.detach()).requires_grad_(backward)
+    matrix = transform_matrix(map_size, 3, dtype=base.dtype)
 
-    def run(convolve: Callable[[Tensor, Tensor], Tensor], weight: Tensor) -> None:
+    def spectral(x: Tensor, weight: Tensor) -> Tensor:
+        coefficients = weight.reshape(fields[1], fields[0], -1)
+        return spectral_conv_pixel_major(x, coefficients, matrix, kernel_size=3)
+
+    def run(convolve: Callable[[Tensor, Tensor], Tensor], x: Tensor, weight: Tensor) -> None:
         with torch.autocast("cpu", torch.bfloat16) if bf16 else contextlib.nullcontext():
             y = convolve(x, weight)
         if backward:
-            torch.autograd.grad(y, (x, weight), upstream.to(y.dtype))
+            torch.autograd.grad(y, (x, weight), torch.ones_like(y))
 
     return alternate(
         [
-            lambda: run(lambda a, w: functional.conv2d(a, w, padding=1), kernel),
-            lambda: run(spectral_conv2d_base, base),
+            lambda: run(lambda a, w: functional.conv2d(a, w, padding=1), x, kernel),
+            lambda: run(spectral, maps, base),
         ],
         repeats,
     )
@@ -80,6 +87,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=15)
     options = parser.parse_args()
+    reuse_memory()
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     print(

@@ -37,10 +37,10 @@ PEER = "published, fp32"
 
 
 def network(scale: str, task: str = "pose", classes: int = 1) -> tuple[nn.Module, Any]:
-    """I2I and what its data would be, always with the same weights."""
+    """I2I with the stem and the basis that escnn has, the weights always the same."""
     config = compose(
         ["model=i2i", f"task={task}", f"scale={scale}", "data=synthetic",
-         "model.encoder.stem_mode=ref"]
+         "model.encoder.stem_mode=ref", "model.encoder.basis=band_limited"]
     )  # fmt: skip
     info = info_of(config, tuple(f"class{i}" for i in range(classes)))
     torch.manual_seed(0)
@@ -66,21 +66,21 @@ def check_peer(ours: nn.Module, peer: nn.Module, batch: dict[str, Tensor]) -> No
         torch.testing.assert_close(ours(some).logits, peer(some).logits, rtol=1e-3, atol=1e-3)
 
 
-def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
-    """Forward, backward and SGD with momentum."""
+def contestants(scale: str, batch_size: int) -> tuple[dict[str, nn.Module], dict[str, Tensor]]:
+    """The networks by name, and a batch for them."""
     ours, info = network(scale)
     batch = noise_batch(info, batch_size)
-    peers = {
-        "published": published(network(scale)[0]),
-        "plain": with_plain_encoder(network(scale)[0]),
-    }
-    check_peer(ours, peers["published"], batch)
+    peer = published(network(scale)[0])
+    check_peer(ours, peer, batch)
+    plain = with_plain_encoder(network(scale)[0])
+    return {"published": peer, "plain": plain, "ours": ours}, batch
+
+
+def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
+    """Forward, backward and SGD with momentum."""
+    nets, batch = contestants(scale, batch_size)
     variants: dict[str, Callable[[], None]] = {}
-    for name, net in {
-        "published": peers["published"],
-        "plain": peers["plain"],
-        "ours": ours,
-    }.items():
+    for name, net in nets.items():
         net.train()
         optimizer = torch.optim.SGD(net.parameters(), lr=1e-3, momentum=0.9, nesterov=True)
         for low in (False, True):
@@ -98,15 +98,8 @@ def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timin
 
 def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
     """Forward in evaluation mode without gradients."""
-    ours, info = network(scale)
-    batch = noise_batch(info, batch_size)
-    nets = {
-        "published": published(network(scale)[0]),
-        "plain": with_plain_encoder(network(scale)[0]),
-        "ours": ours,
-        "ours folded": fold(ours),
-    }
-    check_peer(ours, nets["published"], batch)
+    nets, batch = contestants(scale, batch_size)
+    nets["ours folded"] = fold(nets["ours"])
     variants: dict[str, Callable[[], None]] = {}
     for name, net in nets.items():
         net.eval()

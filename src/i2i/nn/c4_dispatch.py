@@ -15,12 +15,13 @@ from i2i.nn.c4_spectral import is_supported
 MODES = ("auto", "dense", "spectral")
 _MODE = ["auto"]
 
-# Images below which transforming costs more than it saves (benchmarks/c4_spectral.py): in training
-# the filters are transformed at every step, in evaluation once.
+# Images below which transforming costs more than it saves: in training the filters are transformed
+# at every step, in evaluation once. Chosen from runs of the whole network (benchmarks/
+# network_speed.py, which times batches of 1, 8 and 64), not searched for in between.
 _LEAST_BATCH_TRAINING = 16
 _LEAST_BATCH_CACHED = 8
 _LEAST_FIELDS = 16
-_LARGEST_MAP = 9  # 16 × 16 maps: the dense transforms cost what the products save
+_LARGEST_MAP = 9  # 16 × 16 maps gain little, and lose in bfloat16
 
 
 def set_convolution_mode(mode: str) -> None:

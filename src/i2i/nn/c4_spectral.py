@@ -51,6 +51,7 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 
 from i2i.nn.c4_spectral_constants import (
     MAX_MAP_SIZE,
+    ORDER,
     Constants,
     constants,
     is_supported,
@@ -70,7 +71,6 @@ __all__ = [
     "transform_matrix",
 ]
 
-_ORDER = 4  # of the group
 # Of fields x images: all non-zero orbits (n, 4 C, 4 B), columns (Re, Im at R w; Re, Im at w), and
 # w = 0 (4 C, B). What goes into the blocks has rows (sum|difference, slot, field), what comes out
 # (field, sum|difference, slot): so the blocks are written in order, see transform_filters.
@@ -86,7 +86,7 @@ def base_filters(kernel: Tensor) -> Tensor:
     Returns:
         A view, shape (C_out, C_in * 4, k, k).
     """
-    return kernel[::_ORDER]
+    return kernel[::ORDER]
 
 
 def _turns(half: int, slot: int) -> tuple[tuple[int, int, float], tuple[int, int, float]]:
@@ -100,12 +100,12 @@ def _turns(half: int, slot: int) -> tuple[tuple[int, int, float], tuple[int, int
 
 def _part(spectrum: _Spectrum, half: int, slot: int, *, fields_first: bool) -> _Spectrum:
     """Views of one slot of a spectrum: (n, C, 4, B) and (C, B)."""
-    fields = spectrum[1].shape[0] // _ORDER
+    fields = spectrum[1].shape[0] // ORDER
     batch = spectrum[1].shape[1]
     if fields_first:
-        main = spectrum[0].view(-1, fields, 2, 2, _ORDER, batch)[:, :, half, slot]
+        main = spectrum[0].view(-1, fields, 2, 2, ORDER, batch)[:, :, half, slot]
         return main, spectrum[1].view(fields, 2, 2, batch)[:, half, slot]
-    main = spectrum[0].view(-1, 2, 2, fields, _ORDER, batch)[:, half, slot]
+    main = spectrum[0].view(-1, 2, 2, fields, ORDER, batch)[:, half, slot]
     return main, spectrum[1].view(2, 2, fields, batch)[half, slot]
 
 
@@ -120,17 +120,17 @@ def _analyse(
     torch.sub(halves[:, 0], halves[:, 1], out=mixed[:, 1])
     orbits = matrices.orbits
     spectrum = (
-        mixed.new_empty(orbits, _ORDER * fields, _ORDER * batch),
-        mixed.new_empty(_ORDER * fields, batch),
+        mixed.new_empty(orbits, ORDER * fields, ORDER * batch),
+        mixed.new_empty(ORDER * fields, batch),
     )
-    rows = mixed.new_empty(_ORDER * orbits + 1, fields * batch)
+    rows = mixed.new_empty(ORDER * orbits + 1, fields * batch)
     parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
     for half in range(2):
         for slot in range(2):
             for turn, g, sign in _turns(half, slot):
                 torch.mm(sign * matrices.analysis[half][turn], mixed[:, half, g], out=parts[turn])
             main, zero = _part(spectrum, half, slot, fields_first=fields_first)
-            main.copy_(rows[:-1].view(_ORDER, orbits, fields, batch).permute(1, 2, 0, 3))
+            main.copy_(rows[:-1].view(ORDER, orbits, fields, batch).permute(1, 2, 0, 3))
             zero.copy_(rows[-1].view(fields, batch))
     return spectrum
 
@@ -140,14 +140,14 @@ def _synthesise(
 ) -> Tensor:
     """Apply S^T: a spectrum to maps (H^2, 4, C, B) in the dtype and batch size of ``like``."""
     pixels, batch = like.shape[0], like.shape[3]
-    orbits, fields = matrices.orbits, spectrum[1].shape[0] // _ORDER
+    orbits, fields = matrices.orbits, spectrum[1].shape[0] // ORDER
     mixed = spectrum[0].new_empty(pixels, 2, 2, fields * batch)
-    rows = mixed.new_empty(_ORDER * orbits + 1, fields * batch)
+    rows = mixed.new_empty(ORDER * orbits + 1, fields * batch)
     parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
     for half in range(2):
         for slot in range(2):
             main, zero = _part(spectrum, half, slot, fields_first=fields_first)
-            rows[:-1].view(_ORDER, orbits, fields, batch).copy_(main.permute(2, 0, 1, 3))
+            rows[:-1].view(ORDER, orbits, fields, batch).copy_(main.permute(2, 0, 1, 3))
             rows[-1].view(fields, batch).copy_(zero)
             for turn, g, sign in _turns(half, slot):
                 matrix, sums = matrices.analysis[half][turn].mT, mixed[:, half, g]
@@ -159,7 +159,7 @@ def _synthesise(
     y = like.new_empty(pixels, 2, 2, fields * batch)
     torch.add(mixed[:, 0], mixed[:, 1], out=y[:, 0])
     torch.sub(mixed[:, 0], mixed[:, 1], out=y[:, 1])
-    return y.view(pixels, _ORDER, fields, batch)
+    return y.view(pixels, ORDER, fields, batch)
 
 
 def _multiply(blocks: Tensor, spectrum: _Spectrum) -> _Spectrum:
@@ -170,13 +170,13 @@ def _multiply(blocks: Tensor, spectrum: _Spectrum) -> _Spectrum:
 def _coefficient_gradient(upstream: _Spectrum, spectrum: _Spectrum, matrix: Tensor) -> Tensor:
     """dL/d(coefficients), (C_out, C_in, K), one orbit after the other: dA is never whole."""
     out_size, in_size = len(upstream[1]), len(spectrum[1])
-    out_fields, in_fields = out_size // _ORDER, in_size // _ORDER
+    out_fields, in_fields = out_size // ORDER, in_size // ORDER
     total = matrix.new_zeros(out_fields, matrix.shape[1], in_fields)
     block = upstream[1].new_empty(out_size, in_size)
     columns = zip((*upstream[0], upstream[1]), (*spectrum[0], spectrum[1]), strict=True)
-    for part, (left, right) in zip(matrix.split(_ORDER**2), columns, strict=True):
+    for part, (left, right) in zip(matrix.split(ORDER**2), columns, strict=True):
         torch.mm(left, right.mT, out=block)
-        pairs = block.view(out_fields, _ORDER**2, in_fields).to(matrix.dtype)
+        pairs = block.view(out_fields, ORDER**2, in_fields).to(matrix.dtype)
         total.baddbmm_(part.mT.expand(out_fields, -1, -1), pairs)
     return total.mT.contiguous()
 
@@ -267,10 +267,10 @@ def transform_filters(
         Blocks, shape ((N^2 - 1) / 4 + 1, 4 * C_out, 4 * C_in), w = 0 last; rows (field, s'|e', h),
         columns (s|e, g, field).
     """
-    (out_fields, in_fields), parts = coefficients.shape[:2], matrix.split(_ORDER**2)
+    (out_fields, in_fields), parts = coefficients.shape[:2], matrix.split(ORDER**2)
     columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
     blocks = columns.new_empty(
-        len(parts), out_fields, _ORDER**2, in_fields, dtype=dtype or columns.dtype
+        len(parts), out_fields, ORDER**2, in_fields, dtype=dtype or columns.dtype
     )
     rounded = blocks.dtype != columns.dtype
     pairs = columns.new_empty(blocks.shape[1:])
@@ -280,7 +280,7 @@ def transform_filters(
         torch.bmm(part.expand(out_fields, -1, -1), columns, out=out)
         if rounded:
             block.copy_(pairs)
-    return blocks.view(len(parts), _ORDER * out_fields, _ORDER * in_fields)
+    return blocks.view(len(parts), ORDER * out_fields, ORDER * in_fields)
 
 
 def spectral_conv_pixel_major(
@@ -320,10 +320,10 @@ def spectral_product(x: Tensor, blocks: Tensor, *, kernel_size: int) -> Tensor:
         ValueError: if the blocks are those of another map or kernel size.
     """
     count = (padded_size(math.isqrt(len(x)), kernel_size) ** 2 + 3) // 4
-    if blocks.shape[0] != count or blocks.shape[2] != _ORDER * x.shape[2]:
+    if blocks.shape[0] != count or blocks.shape[2] != ORDER * x.shape[2]:
         raise ValueError(
             f"The blocks {tuple(blocks.shape)} do not fit maps {tuple(x.shape)} and a "
-            f"{kernel_size}x{kernel_size} kernel, which take ({count}, *, {_ORDER * x.shape[2]}): "
+            f"{kernel_size}x{kernel_size} kernel, which take ({count}, *, {ORDER * x.shape[2]}): "
             "call transform_filters with the transform_matrix of this map size."
         )
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
@@ -346,7 +346,7 @@ def spectral_conv2d_base(x: Tensor, base: Tensor) -> Tensor:
     """
     _check(x, base.shape[1], base.shape[-1])
     matrix = transform_matrix(x.shape[2], base.shape[-1], dtype=base.dtype, device=base.device)
-    coefficients = base.reshape(len(base), base.shape[1] // _ORDER, matrix.shape[1])
+    coefficients = base.reshape(len(base), base.shape[1] // ORDER, matrix.shape[1])
     y = spectral_conv_pixel_major(
         to_pixel_major(x), coefficients, matrix, kernel_size=base.shape[-1]
     )
@@ -370,7 +370,7 @@ def spectral_conv2d(x: Tensor, kernel: Tensor) -> Tensor:
     Raises:
         ValueError: if the shapes do not fit together or the convolution is not supported.
     """
-    if kernel.ndim != 4 or kernel.shape[0] % _ORDER:
+    if kernel.ndim != 4 or kernel.shape[0] % ORDER:
         raise ValueError(
             f"Expected an expanded kernel (C_out * 4, C_in * 4, k, k), got {tuple(kernel.shape)}; "
             "base filters go to spectral_conv2d_base."
@@ -387,10 +387,10 @@ def product_dtype(x: Tensor) -> torch.dtype:
 
 def _check(x: Tensor, channels: int, kernel_size: int) -> None:
     """Raise a ValueError that names the shapes unless the convolution is supported."""
-    if x.ndim != 4 or x.shape[2] != x.shape[3] or x.shape[1] != channels or channels % _ORDER:
+    if x.ndim != 4 or x.shape[2] != x.shape[3] or x.shape[1] != channels or channels % ORDER:
         raise ValueError(
             f"Expected square maps (B, {channels}, H, H) for filters with {channels} input "
-            f"channels (a multiple of {_ORDER}), got {tuple(x.shape)}."
+            f"channels (a multiple of {ORDER}), got {tuple(x.shape)}."
         )
     if not is_supported(x.shape[2], kernel_size):
         raise ValueError(

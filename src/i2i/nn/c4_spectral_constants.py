@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_ORDER = 4  # of the group
+ORDER = 4  # of the group
 MAX_MAP_SIZE = 17  # the transform is a dense N^2 x H^2 matrix: pointless beyond such maps
 
 
@@ -81,7 +81,7 @@ def _orbits(size: int) -> list[tuple[int, int]]:
         for b in range(size):
             if (a, b) not in seen:
                 found.append((a, b))
-                for _ in range(_ORDER):
+                for _ in range(ORDER):
                     seen.add((a, b))
                     a, b = -b % size, a
     return found
@@ -113,14 +113,14 @@ def _filters(omega: Tensor, kernel_size: int) -> Tensor:
     """``Constants.filters`` in float64."""
     offset = torch.arange(kernel_size, dtype=torch.float64) - kernel_size // 2
     tap = torch.cartesian_prod(offset, offset)  # (k^2, 2), (row, column)
-    filters = omega.new_zeros(len(omega), 2, 2, 2, 2, _ORDER, len(tap))
+    filters = omega.new_zeros(len(omega), 2, 2, 2, 2, ORDER, len(tap))
     for h in range(2):  # A_{h,g}(w) = sum_t K_{0,g-h}(t) exp(i w . R^h t)
         angle = omega @ tap.T  # (orbits + 1, k^2)
         for g in range(2):
-            for j, sign in (((g - h) % _ORDER, 1.0), ((g + 2 - h) % _ORDER, -1.0)):
+            for j, sign in (((g - h) % ORDER, 1.0), ((g + 2 - h) % ORDER, -1.0)):
                 filters[:, 0, h, 0, g, j] = angle.cos()  # Re P
                 filters[:, 0, h, 1, g, j] = -sign * angle.sin()  # -Im M
                 filters[:, 1, h, 0, g, j] = angle.sin()  # Im P
                 filters[:, 1, h, 1, g, j] = sign * angle.cos()  # Re M
         tap = _turn(tap)
-    return filters.view(-1, _ORDER * len(tap))
+    return filters.view(-1, ORDER * len(tap))

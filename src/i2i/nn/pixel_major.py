@@ -6,13 +6,13 @@ import math
 
 from torch import Tensor
 
-_ORDER = 4  # of the group
+from i2i.nn.c4_spectral_constants import ORDER
 
 
 def to_pixel_major(x: Tensor) -> Tensor:
     """Rearrange maps (B, C * 4, H, W), channel = field * 4 + g, to (H * W, 4, C, B)."""
     batch, channels, height, width = x.shape
-    fields = x.reshape(batch, channels // _ORDER, _ORDER, height * width)
+    fields = x.reshape(batch, channels // ORDER, ORDER, height * width)
     return fields.permute(3, 2, 1, 0).contiguous()
 
 
