@@ -3,7 +3,8 @@
 Times forward and forward + backward (gradients of the maps and of the filters, filter transform
 included) of ``torch.nn.functional.conv2d`` with the expanded kernel and of
 :func:`i2i.nn.c4_spectral.spectral_conv_pixel_major`, each on maps in its own layout, and prints
-medians, minima and ratios. The dense side starts from the ready expanded kernel, so the cost of expanding it is not counted against it.
+medians, minima and ratios. The dense side starts from the ready expanded kernel, so the cost of
+expanding it is not counted against it.
 
 Example:
     python benchmarks/c4_spectral.py --threads 2 --repeats 15
