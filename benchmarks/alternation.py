@@ -21,7 +21,11 @@ class Timing:
 
 
 def alternate(
-    variants: Mapping[str, Callable[[], object]], *, repeats: int, warm_up: int = 1
+    variants: Mapping[str, Callable[[], object]],
+    *,
+    repeats: int,
+    warm_up: int = 1,
+    finish: Callable[[], object] = lambda: None,
 ) -> dict[str, Timing]:
     """Run the variants in turn and time each.
 
@@ -29,12 +33,15 @@ def alternate(
         variants: What to call, by name.
         repeats: Timed rounds; at least 2.
         warm_up: Rounds before them.
+        finish: Called before the clock is read; on a GPU, `torch.cuda.synchronize`.
     """
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     for turn in range(warm_up + repeats):
         for name, run in variants.items():
+            finish()
             start = time.perf_counter()
             run()
+            finish()
             if turn >= warm_up:
                 seconds[name].append(time.perf_counter() - start)
     timings = {}

@@ -3,6 +3,7 @@
 python benchmarks/network_speed.py                       # all, scale=paper, ten minutes
 python benchmarks/network_speed.py --parts head build    # some
 python benchmarks/network_speed.py --scale small --repeats 9
+python benchmarks/network_speed.py --device cuda --repeats 20
 
 The peers are escnn's dense layers with correct residual blocks and the direct head (`published`),
 and the encoder's widths in plain torch.nn with our head (`plain`). Variants run alternately in one
@@ -34,6 +35,7 @@ from peers import DirectHead, PlainResNet18, escnn_encoder, published
 RESULTS = Path(__file__).parent / "results"
 PARTS = ("step", "inference", "head", "build")
 PEER = "published, fp32"
+Timings = dict[str, Timing]
 
 
 def network(scale: str, task: str = "pose", classes: int = 1) -> tuple[nn.Module, Any]:
@@ -53,9 +55,15 @@ def with_plain_encoder(ours: nn.Module) -> nn.Module:
     return ours
 
 
-def autocast(enabled: bool) -> torch.autocast:
+def autocast(device: str, enabled: bool) -> torch.autocast:
     """bf16 products, or none."""
-    return torch.autocast("cpu", torch.bfloat16, enabled=enabled)
+    return torch.autocast(device, torch.bfloat16, enabled=enabled)
+
+
+def alternate_on(device: str, variants: dict[str, Callable[[], None]], **given: int) -> Timings:
+    """`alternate`, with a GPU's work waited for."""
+    finish = torch.cuda.synchronize if device == "cuda" else lambda: None
+    return alternate(variants, finish=finish, **given)
 
 
 def check_peer(ours: nn.Module, peer: nn.Module, batch: dict[str, Tensor]) -> None:
@@ -66,19 +74,23 @@ def check_peer(ours: nn.Module, peer: nn.Module, batch: dict[str, Tensor]) -> No
         torch.testing.assert_close(ours(some).logits, peer(some).logits, rtol=1e-3, atol=1e-3)
 
 
-def contestants(scale: str, batch_size: int) -> tuple[dict[str, nn.Module], dict[str, Tensor]]:
+def contestants(
+    scale: str, device: str, batch_size: int
+) -> tuple[dict[str, nn.Module], dict[str, Tensor]]:
     """The networks by name, and a batch for them."""
     ours, info = network(scale)
     batch = noise_batch(info, batch_size)
     peer = published(network(scale)[0])
     check_peer(ours, peer, batch)
     plain = with_plain_encoder(network(scale)[0])
-    return {"published": peer, "plain": plain, "ours": ours}, batch
+    nets = {"published": peer, "plain": plain, "ours": ours}
+    batch = {name: value.to(device) for name, value in batch.items()}
+    return {name: net.to(device) for name, net in nets.items()}, batch
 
 
-def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
+def training_steps(scale: str, device: str, repeats: int, batch_size: int) -> Timings:
     """Forward, backward and SGD with momentum."""
-    nets, batch = contestants(scale, batch_size)
+    nets, batch = contestants(scale, device, batch_size)
     variants: dict[str, Callable[[], None]] = {}
     for name, net in nets.items():
         net.train()
@@ -86,19 +98,19 @@ def training_steps(scale: str, repeats: int, batch_size: int) -> dict[str, Timin
         for low in (False, True):
 
             def step(net: nn.Module = net, optimizer: Any = optimizer, low: bool = low) -> None:  # noqa: ANN401
-                with autocast(low):
+                with autocast(device, low):
                     loss = torch.stack(list(net.loss(net(batch), batch).values())).sum()
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
 
             variants[f"{name}, {'bf16' if low else 'fp32'}"] = step
-    return alternate(variants, repeats=repeats)
+    return alternate_on(device, variants, repeats=repeats, warm_up=2)
 
 
-def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
+def inference(scale: str, device: str, repeats: int, batch_size: int) -> Timings:
     """Forward in evaluation mode without gradients."""
-    nets, batch = contestants(scale, batch_size)
+    nets, batch = contestants(scale, device, batch_size)
     nets["ours folded"] = fold(nets["ours"])
     variants: dict[str, Callable[[], None]] = {}
     for name, net in nets.items():
@@ -106,19 +118,19 @@ def inference(scale: str, repeats: int, batch_size: int) -> dict[str, Timing]:
         for low in (False, True):
 
             def run(net: nn.Module = net, low: bool = low) -> None:
-                with torch.no_grad(), autocast(low):
+                with torch.no_grad(), autocast(device, low):
                     net(batch)
 
             variants[f"{name}, {'bf16' if low else 'fp32'}"] = run
-    return alternate(variants, repeats=repeats, warm_up=2)
+    return alternate_on(device, variants, repeats=repeats, warm_up=2)
 
 
-def heads(task: str, classes: int, repeats: int, batch_size: int) -> dict[str, Timing]:
+def heads(task: str, classes: int, device: str, repeats: int, batch_size: int) -> Timings:
     """Projector and group convolution at `scale=paper`, forward and backward."""
     net, _ = network("paper", task, classes)
-    trunk = net.trunk
-    direct = DirectHead(trunk.projector, trunk.group_conv)
-    maps = torch.rand(batch_size, 304, 8, 8, requires_grad=True)
+    trunk = net.trunk.to(device)
+    direct = DirectHead(trunk.projector, trunk.group_conv).to(device)
+    maps = torch.rand(batch_size, 304, 8, 8, device=device, requires_grad=True)
 
     def ours(x: Tensor) -> Tensor:
         return trunk.group_conv(trunk.projector(x), None)
@@ -128,16 +140,11 @@ def heads(task: str, classes: int, repeats: int, batch_size: int) -> dict[str, T
     def run(head: Callable[[Tensor], Tensor]) -> None:
         head(maps).square().sum().backward()
 
-    return alternate(
-        {
-            PEER: lambda: run(direct),
-            "ours, fp32": lambda: run(ours),
-        },
-        repeats=repeats,
-    )
+    variants = {PEER: lambda: run(direct), "ours, fp32": lambda: run(ours)}
+    return alternate_on(device, variants, repeats=repeats)
 
 
-def building(scale: str) -> dict[str, Timing]:
+def building(scale: str) -> Timings:
     """Making the network once; escnn's own initialisation is what the published one waits for."""
     start = time.perf_counter()
     ours, _ = network(scale)
@@ -150,25 +157,25 @@ def building(scale: str) -> dict[str, Timing]:
     }
 
 
-def measure(options: argparse.Namespace) -> dict[str, dict[str, Timing]]:
+def measure(options: argparse.Namespace) -> dict[str, Timings]:
     """All parts that were asked for, by title."""
-    scale, repeats, size = options.scale, options.repeats, options.batch
-    found: dict[str, dict[str, Timing]] = {}
+    scale, device, repeats, size = options.scale, options.device, options.repeats, options.batch
+    found: dict[str, Timings] = {}
     if "step" in options.parts:
-        found[f"training step, batch {size}"] = training_steps(scale, repeats, size)
+        found[f"training step, batch {size}"] = training_steps(scale, device, repeats, size)
     if "inference" in options.parts:
         for batch in (size, 8, 1):
             more = repeats if batch > 8 else 4 * repeats
-            found[f"inference, batch {batch}"] = inference(scale, more, batch)
+            found[f"inference, batch {batch}"] = inference(scale, device, more, batch)
     if "head" in options.parts:
         for task, classes, what in (("pose", 1, "7 outputs"), ("classification", 40, "40 classes")):
-            found[f"head forward+backward, {what}"] = heads(task, classes, repeats, size)
+            found[f"head forward+backward, {what}"] = heads(task, classes, device, repeats, size)
     if "build" in options.parts:
         found["building"] = building(scale)
     return found
 
 
-def table(found: dict[str, dict[str, Timing]], before: dict[str, Any]) -> str:
+def table(found: dict[str, Timings], before: dict[str, Any]) -> str:
     """Markdown: milliseconds with quartiles, and how many times faster than the published peer."""
     lines = ["| | variant | ms [quartiles] | ratio | before |", "|---|---|--:|--:|--:|"]
     for title, timings in found.items():
@@ -180,7 +187,7 @@ def table(found: dict[str, dict[str, Timing]], before: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def plot(found: dict[str, dict[str, Timing]], path: Path) -> None:
+def plot(found: dict[str, Timings], path: Path) -> None:
     """Bars of the ratios."""
     from i2i.viz.style import (  # matplotlib only where it is needed
         new_figure,
@@ -217,17 +224,19 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--name", help="of the files; network_speed_<scale>")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--name", help="of the files; network_speed_<scale>, on a GPU with _cuda")
     options = parser.parse_args()
     reuse_memory()
     torch.set_num_threads(options.threads)
-    name = options.name or f"network_speed_{options.scale}"
+    ending = "" if options.device == "cpu" else f"_{options.device}"
+    name = options.name or f"network_speed_{options.scale}{ending}"
     file = RESULTS / f"{name}.json"
     before = json.loads(file.read_text())["parts"] if file.is_file() else {}
     found = measure(options)
     text = table(found, before)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"{text}\n\n{options.threads} threads, scale={options.scale}")
+    print(f"{text}\n\n{options.threads} threads, scale={options.scale}, {options.device}")
     print(f"peak resident memory of all together {peak:.1f} GiB")
     parts = {
         title: {
@@ -243,6 +252,8 @@ def main() -> None:
         "threads": options.threads,
         "capability": torch.backends.cpu.get_cpu_capability(),
     }
+    if options.device == "cuda":
+        machine["gpu"] = torch.cuda.get_device_name()
     file.write_text(json.dumps({"machine": machine, "parts": {**before, **parts}}, indent=1) + "\n")
     file.with_suffix(".md").write_text(text + "\n")
     plot(found, file.with_suffix(".png"))

@@ -28,11 +28,14 @@ def escnn_encoder(ours: C4ResNet18, *, initialize: bool = False) -> nn.Module:
 
 
 class _EscnnEncoder(nn.Module):
+    mask: Tensor
+
     def __init__(self, ours: C4ResNet18, initialize: bool) -> None:
         super().__init__()
         if ours.stem_mode not in ("ref", "odd"):
             raise ValueError(f"escnn has no even kernels: stem_mode={ours.stem_mode!r}")
-        self.background, self.mask = ours.background, ours.mask
+        self.background = ours.background
+        self.register_buffer("mask", ours.mask)
         self.out_channels, self.map_size = ours.out_channels, ours.map_size
         self.stem = _conv(ours.stem, initialize)
         self.norm = _norm(ours.norm)
@@ -99,10 +102,12 @@ class DirectHead(nn.Module):
     """
 
     moved: Tensor
+    sampling: Tensor
 
     def __init__(self, projector: IcosahedralProjector, group_conv: DynamicFilterConv) -> None:
         super().__init__()
-        self.linear, self.sampling = projector.linear, projector.sampling
+        self.linear = projector.linear
+        self.register_buffer("sampling", projector.sampling)
         self.sphere, self.bias = group_conv.sphere, group_conv.bias
         self.features, self.out_features = group_conv.features, group_conv.out_features
         mesh = icosahedron(1)
