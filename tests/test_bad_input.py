@@ -36,6 +36,8 @@ TINY = ["scale=tiny", "trainer.accelerator=cpu"]
         ("train", ["data=meshes", "data.root=nowhere"], ["nowhere"]),
         ("train", ["data.modality=infrared"], ["infrared", "gray"]),
         ("train", ["model.label_frame=wrong"], ["consistent", "reference"]),
+        ("train", ["+trainer.sync_batchnorm=true"], ["already", "leave it out"]),
+        ("train", ["trainer.devices=2", "trainer.strategy=ddp_spawn"], ["trainer.strategy=ddp"]),
         ("train", ["resume=runs/nothing"], ["runs/nothing"]),
         ("predict", ["run=runs/nothing", "input=a.png"], ["runs/nothing", "ls -t runs"]),
         ("evaluate", ["run=runs/nothing"], ["runs/nothing"]),

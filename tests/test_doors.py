@@ -165,14 +165,31 @@ def test_resume_refuses_words_that_would_change_the_result(door, workplace, trai
     assert "Traceback" not in done.stderr
 
 
-def test_two_processes_train_and_test_every_image_once(fresh_door, workplace):
-    fresh_door(
-        "train", *TINY, NO_PICTURES, "trainer.devices=2", "trainer.strategy=ddp", "run_name=ddp",
-        cwd=workplace,
-    )  # fmt: skip
-    arrays = np.load(workplace / "runs" / "ddp" / "predictions.npz")
+def test_two_processes_compute_what_one_does(fresh_door, workplace):
+    """In float64: the same losses at every step, and every test image once."""
+    words = (*TINY, NO_PICTURES, "scale.reg_on=gt_always", "trainer.precision=64-true",
+             "trainer.log_every_n_steps=1")  # fmt: skip
+    fresh_door("train", *words, "run_name=single", cwd=workplace)
+    both = ("trainer.devices=2", "trainer.strategy=ddp")
+    fresh_door("train", *words, *both, "run_name=ddp", cwd=workplace)
+    curves = [train_losses(workplace / "runs" / name) for name in ("single", "ddp")]
+    assert len(curves[0]) == 10
+    np.testing.assert_allclose(curves[1], curves[0], rtol=1e-6)  # events are float32
+    single, arrays = (
+        np.load(workplace / "runs" / name / "predictions.npz") for name in ("single", "ddp")
+    )
     pairs = set(zip(arrays["instance_id"].tolist(), arrays["view_id"].tolist(), strict=True))
     assert len(arrays["error_deg"]) == len(pairs) == 12
+    np.testing.assert_allclose(
+        np.sort(arrays["error_deg"]), np.sort(single["error_deg"]), rtol=1e-4, atol=1e-4
+    )
+
+
+def train_losses(folder):
+    """The training loss of every step that was logged."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    return [event.value for event in EventAccumulator(str(folder)).Reload().Scalars("train/loss")]
 
 
 def test_an_encoder_from_another_package_trains_without_a_change_here(

@@ -176,12 +176,17 @@ def _resumed(cfg: DictConfig, folder: RunFolder) -> DictConfig:
     return merged
 
 
-def _check_processes(trainer: Trainer) -> None:
+def _check_processes(cfg: DictConfig, trainer: Trainer) -> None:
     """Refuse ways of starting processes that would lose results or repeat a sweep.
 
     Raises:
         ConfigurationError: naming the reason and what to use instead.
     """
+    if cfg.trainer.get("sync_batchnorm"):
+        raise ConfigurationError(
+            "trainer.sync_batchnorm=true would replace batch norms that know C4 fields; those of "
+            "i2i share their statistics over processes already. Leave it out"
+        )
     if trainer.world_size > 1 and _in_sweep():
         raise ConfigurationError(
             f"a sweep (-m) with {trainer.world_size} processes a job: every extra process would "
@@ -219,7 +224,7 @@ def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
         default_root_dir=str(folder.path),
         _convert_="all",
     )
-    _check_processes(trainer)
+    _check_processes(cfg, trainer)
     return trainer
 
 

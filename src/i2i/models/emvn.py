@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from i2i.models.pooled import Component
 from i2i.models.prediction import ClassPrediction
 from i2i.models.views import ViewFeatures, camera_set_of
+from i2i.nn.batch_norm import JointBatchNorm1d
 from i2i.nn.precision import at_least_float32
 from i2i.nn.view_convs import GroupConv, TappedConv, ViewsToGroup
 
@@ -83,7 +84,7 @@ class EMVN(nn.Module):
             first = ViewsToGroup(features, features, camera_set=cameras)
         others = (GroupConv(features, features) for _ in range(layers - 1))
         self.convs = nn.ModuleList([first, *others])
-        self.norms = nn.ModuleList(nn.BatchNorm1d(features) for _ in range(layers))
+        self.norms = nn.ModuleList(JointBatchNorm1d(features) for _ in range(layers))
         self.classifier = nn.Linear(features, num_classes)
 
     def descriptor(self, feature: Tensor) -> Tensor:

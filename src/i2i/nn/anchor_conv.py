@@ -15,6 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from i2i.geometry.icosahedron import icosahedron
 from i2i.geometry.points import ball_query, gather_points
+from i2i.nn.batch_norm import JointBatchNorm1d
 from i2i.nn.kernel_points import kernel_points
 from i2i.nn.precision import at_least_float32, full_precision
 
@@ -256,7 +257,7 @@ class AnchorNorm(nn.Module):
         super().__init__()
         if kind not in NORMS:
             raise ValueError(f"norm={kind!r} is not known: choose one of {', '.join(NORMS)}")
-        self.batch = nn.BatchNorm1d(channels, eps=_EPS) if kind == "batch" else None
+        self.batch = JointBatchNorm1d(channels, eps=_EPS) if kind == "batch" else None
 
     def forward(self, features: Tensor) -> Tensor:
         """Normalise, see the class; statistics in float32 or wider."""

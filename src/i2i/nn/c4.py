@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from i2i.nn.batch_norm import JointBatchNorm2d
 from i2i.nn.c4_basis import TURNS, full_basis, symmetrise
 from i2i.nn.c4_dispatch import is_traced
 from i2i.nn.c4_spectral import (
@@ -353,8 +354,10 @@ def _same(snapshot: Tensor, weights: Tensor) -> bool:
     )
 
 
-class C4BatchNorm(nn.BatchNorm2d):
+class C4BatchNorm(JointBatchNorm2d):
     """Batch norm with one affine pair per regular field, statistics pooled over the four turns.
+
+    Where processes share a batch, the statistics are those of all of it.
 
     Shape:
         (B, 4 · num_fields, H, W) -> the same.

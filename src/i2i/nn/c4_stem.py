@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx, once_differentiable
 from torch.nn import functional
 
+from i2i.nn.batch_norm import sum_over_processes, update_running
 from i2i.nn.c4 import TURNS, C4BatchNorm, C4Conv
 from i2i.nn.precision import full_precision
 
@@ -51,8 +52,9 @@ def stem_map(image: Tensor, conv: C4Conv, norm: C4BatchNorm, pool: nn.Module) ->
 def _fold(kernel: Tensor, norm: C4BatchNorm, patches: Tensor) -> tuple[Tensor, Tensor]:
     """Kernel (4F, K) and bias (4F,) of convolution and batch norm together."""
     if norm.training or norm.running_mean is None or norm.running_var is None:
-        mean, var = _field_moments(kernel, patches)
-        _update(norm, mean, var, count=TURNS * patches.shape[0] * patches.shape[2])
+        mean, var, count = _field_moments(kernel, patches, shared=norm.training)
+        if norm.training:
+            update_running(norm, mean, var, count=count)
     else:
         mean, var = norm.running_mean.double(), norm.running_var.double()
     scale = norm.weight.double() / (var + norm.eps).sqrt()
@@ -61,33 +63,27 @@ def _fold(kernel: Tensor, norm: C4BatchNorm, patches: Tensor) -> tuple[Tensor, T
     return weight.to(kernel), shift.repeat_interleave(TURNS).to(kernel)
 
 
-def _field_moments(kernel: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and (biased) variance of each field's outputs: (F,), (F,), in float64."""
+def _field_moments(
+    kernel: Tensor, patches: Tensor, *, shared: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and (biased) variance of each field's outputs, (F,), and their number, in float64.
+
+    The patches' own moments are constants, so that sharing them over processes is all that the
+    joint gradient needs.
+    """
     batch, size, places = patches.shape
     first, second = kernel.new_zeros(size).double(), kernel.new_zeros(size, size).double()
     for some in patches.detach().split(_IMAGES_AT_ONCE):
         columns = some.transpose(0, 1).reshape(size, -1).double()
         first += columns.sum(dim=1)
         second += columns @ columns.T
-    count = batch * places
+    rows = first.new_full((1,), batch * places)
+    if shared:
+        first, second, rows = sum_over_processes(first, second, rows)
     wide = kernel.double()
-    means = (wide @ (first / count)).view(-1, TURNS).mean(dim=1)
-    squares = ((wide @ (second / count)) * wide).sum(dim=1).view(-1, TURNS).mean(dim=1)
-    return means, (squares - means.square()).clamp(min=0.0)
-
-
-@torch.no_grad()
-def _update(norm: C4BatchNorm, mean: Tensor, var: Tensor, *, count: int) -> None:
-    """Running statistics as `nn.BatchNorm2d` keeps them: with the unbiased variance."""
-    if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
-        return
-    norm.num_batches_tracked.add_(1)
-    momentum = norm.momentum
-    if momentum is None:
-        momentum = 1.0 / float(norm.num_batches_tracked)
-    norm.running_mean.lerp_(mean.to(norm.running_mean), momentum)
-    unbiased = var * (count / max(count - 1, 1))
-    norm.running_var.lerp_(unbiased.to(norm.running_var), momentum)
+    means = (wide @ (first / rows)).view(-1, TURNS).mean(dim=1)
+    squares = ((wide @ (second / rows)) * wide).sum(dim=1).view(-1, TURNS).mean(dim=1)
+    return means, (squares - means.square()).clamp(min=0.0), TURNS * rows
 
 
 class _PooledProduct(torch.autograd.Function):

@@ -11,6 +11,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from i2i.nn.batch_norm import JointBatchNorm2d
 from i2i.nn.c4 import TURNS, C4BatchNorm, C4Conv, group_max_pool
 from i2i.nn.c4_resnet import C4BasicBlock, C4ResNet18
 from i2i.nn.log_polar import CircularRowsConv2d
@@ -28,7 +29,7 @@ _PAIRS: dict[type[nn.Module], tuple[tuple[str, str], ...]] = {
 }
 # Types are compared exactly: a subclass may do anything with its weights.
 _CONVOLUTIONS = (nn.Conv2d, CircularRowsConv2d)
-_NORMS = (nn.BatchNorm2d, C4BatchNorm)
+_NORMS = (nn.BatchNorm2d, JointBatchNorm2d, C4BatchNorm)
 
 
 def fold(network: nn.Module) -> nn.Module:

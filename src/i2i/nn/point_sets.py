@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from i2i.geometry.points import ball_query, farthest_point_sample, gather_points
+from i2i.nn.batch_norm import JointBatchNorm1d, num_processes
 
 
-class RowNorm(nn.BatchNorm1d):
+class RowNorm(JointBatchNorm1d):
     """Batch norm of rows (N, C) which takes a single one too, even in training.
 
     One row has no variance of its own; the running statistics stand in for it.
@@ -16,7 +17,7 @@ class RowNorm(nn.BatchNorm1d):
 
     def forward(self, rows: Tensor) -> Tensor:
         """(N, C) -> (N, C)."""
-        if self.training and len(rows) == 1:
+        if self.training and len(rows) == 1 and num_processes() == 1:
             return nn.functional.batch_norm(
                 rows, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
             )

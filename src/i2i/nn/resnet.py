@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from i2i.nn.batch_norm import JointBatchNorm2d
 from i2i.nn.log_polar import CircularRowsConv2d, CircularRowsMaxPool2d
 
 _BLOCKS_PER_LAYER = 2
@@ -25,14 +26,14 @@ class BasicBlock(nn.Module):
         super().__init__()
         conv = CircularRowsConv2d if circular_rows else nn.Conv2d
         self.conv1 = conv(in_channels, out_channels, 3, stride, 1, bias=False)
-        self.norm1 = nn.BatchNorm2d(out_channels)
+        self.norm1 = JointBatchNorm2d(out_channels)
         self.conv2 = conv(out_channels, out_channels, 3, 1, 1, bias=False)
-        self.norm2 = nn.BatchNorm2d(out_channels)
+        self.norm2 = JointBatchNorm2d(out_channels)
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or in_channels != out_channels:
             self.shortcut = nn.Sequential(
                 nn.Conv2d(in_channels, out_channels, 1, stride, bias=False),
-                nn.BatchNorm2d(out_channels),
+                JointBatchNorm2d(out_channels),
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -92,7 +93,7 @@ class ResNet18(nn.Module):
         conv = CircularRowsConv2d if circular_rows else nn.Conv2d
         pool = CircularRowsMaxPool2d if circular_rows else nn.MaxPool2d
         self.stem = conv(in_channels, width, stem_size, 2, stem_size // 2, bias=False)
-        self.norm = nn.BatchNorm2d(width)
+        self.norm = JointBatchNorm2d(width)
         self.max_pool = pool(3, 2, 1) if max_pool else nn.Identity()
 
         blocks: list[nn.Module] = []

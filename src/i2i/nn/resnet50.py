@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from i2i.nn.batch_norm import JointBatchNorm2d
+
 _BLOCKS = (3, 4, 6, 3)
 _EXPANSION = 4
 
@@ -21,16 +23,16 @@ class Bottleneck(nn.Module):
         super().__init__()
         out_channels = _EXPANSION * width
         self.conv1 = nn.Conv2d(in_channels, width, 1, bias=False)
-        self.norm1 = nn.BatchNorm2d(width)
+        self.norm1 = JointBatchNorm2d(width)
         self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
-        self.norm2 = nn.BatchNorm2d(width)
+        self.norm2 = JointBatchNorm2d(width)
         self.conv3 = nn.Conv2d(width, out_channels, 1, bias=False)
-        self.norm3 = nn.BatchNorm2d(out_channels)
+        self.norm3 = JointBatchNorm2d(out_channels)
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or in_channels != out_channels:
             self.shortcut = nn.Sequential(
                 nn.Conv2d(in_channels, out_channels, 1, stride, bias=False),
-                nn.BatchNorm2d(out_channels),
+                JointBatchNorm2d(out_channels),
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -87,7 +89,7 @@ class ResNet50(nn.Module):
         self.in_channels, self.image_size = in_channels, image_size
         self.out_channels = _EXPANSION * width * 2 ** (len(_BLOCKS) - 1)
         self.stem = nn.Conv2d(in_channels, width, 7, stride=2, padding=3, bias=False)
-        self.norm = nn.BatchNorm2d(width)
+        self.norm = JointBatchNorm2d(width)
         self.max_pool = nn.MaxPool2d(3, stride=2, padding=1) if max_pool else nn.Identity()
 
         blocks: list[nn.Module] = []

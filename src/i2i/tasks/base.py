@@ -58,8 +58,10 @@ class Task(LightningModule):
         terms = self.network.loss(self.network(batch), batch)  # type: ignore[operator]
         loss = torch.stack(list(terms.values())).sum()
         size = len(batch["class_id"])
-        self.log("train/loss", loss, prog_bar=True, batch_size=size)
-        self.log_dict({f"train/loss_{k}": v for k, v in terms.items()}, batch_size=size)
+        self.log("train/loss", loss, prog_bar=True, batch_size=size, sync_dist=True)
+        self.log_dict(
+            {f"train/loss_{k}": v for k, v in terms.items()}, batch_size=size, sync_dist=True
+        )
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:

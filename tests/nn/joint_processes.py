@@ -1,0 +1,89 @@
+"""What the tests of batch norm over processes run in each of them."""
+
+import copy
+from pathlib import Path
+
+import torch
+from torch import Tensor, distributed, nn
+
+from i2i.nn.c4 import C4BatchNorm
+from i2i.nn.c4_dispatch import convolution_mode
+
+PROCESSES = 2
+
+
+class PixelMajor(nn.Module):
+    """C4 batch norm of pixel-major maps, the batch first for once, with ReLU."""
+
+    def __init__(self, fields):
+        super().__init__()
+        self.norm = C4BatchNorm(fields)
+
+    def forward(self, x):
+        out = self.norm.pixel_major(x.permute(1, 2, 3, 0).contiguous(), relu=True)
+        return out.permute(3, 0, 1, 2)
+
+
+def in_processes(work, folder: Path, *given) -> list:
+    """What `work(rank, *given)` returns in each of two processes that share a group."""
+    torch.multiprocessing.spawn(_run, args=(work, str(folder), given), nprocs=PROCESSES)
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(PROCESSES)]
+
+
+def _run(rank: int, work, folder: str, given: tuple) -> None:
+    torch.set_num_threads(1)
+    distributed.init_process_group(
+        "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=PROCESSES
+    )
+    torch.save(work(rank, *given), Path(folder) / f"{rank}.pt")
+    distributed.destroy_process_group()
+
+
+def share(x: Tensor, rank: int) -> Tensor:
+    """The part of a batch that a process sees."""
+    return x.chunk(PROCESSES)[rank]
+
+
+def layer_step(module: nn.Module, x: Tensor, upstream: Tensor) -> dict[str, Tensor]:
+    """Output, gradients, and running statistics of the batch norms."""
+    x = x.clone().requires_grad_()
+    module = copy.deepcopy(module).train()  # processes share the memory of what they are given
+    out = module(x)
+    out.backward(upstream)
+    return {
+        "out": out.detach(),
+        "of x": x.grad,
+        **{f"of {name}": p.grad for name, p in module.named_parameters()},
+        **{name: b.clone() for name, b in module.named_buffers() if "running" in name},
+    }
+
+
+def layer_in_process(rank: int, cases: dict[str, tuple]) -> dict[str, dict[str, Tensor]]:
+    """`layer_step` of each case with this process's share of its batch."""
+    return {
+        name: layer_step(module, share(x, rank), share(upstream, rank))
+        for name, (module, x, upstream) in cases.items()
+    }
+
+
+def network_step(network: nn.Module, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Loss, gradients of the parameters, and running statistics."""
+    network = copy.deepcopy(network).train()
+    loss = torch.stack(list(network.loss(network(batch), batch).values())).sum()
+    loss.backward()
+    return {
+        "loss": loss.detach(),
+        **{f"of {n}": p.grad for n, p in network.named_parameters() if p.grad is not None},
+        **{name: b.clone() for name, b in network.named_buffers() if "running" in name},
+    }
+
+
+def network_in_process(
+    rank: int, cases: dict[str, tuple], convolution: str
+) -> dict[str, dict[str, Tensor]]:
+    """`network_step` of each case with this process's share of its batch."""
+    with convolution_mode(convolution):
+        return {
+            name: network_step(network, {key: share(value, rank) for key, value in batch.items()})
+            for name, (network, batch) in cases.items()
+        }
