@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
@@ -192,8 +193,7 @@ def _check_processes(cfg: DictConfig, trainer: Trainer) -> None:
             f"a sweep (-m) with {trainer.world_size} processes a job: every extra process would "
             "start the whole sweep again. Use trainer.devices=1"
         )
-    launcher = trainer.strategy.launcher
-    if launcher is not None and launcher.is_interactive_compatible:
+    if isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
         raise ConfigurationError(
             "trainer.strategy with spawn or fork: its processes end with the test and take the "
             "predictions with them. Use trainer.strategy=ddp"
