@@ -9,7 +9,7 @@ The peers are escnn's dense layers with correct residual blocks and the direct h
 and the encoder's widths in plain torch.nn with our head (`plain`). Variants run alternately in one
 process; what counts are the ratios. Before anything is timed the published peer has to give the
 same answers. Writes `benchmarks/results/<name>.json`, `.md` and `.png`; an earlier JSON of the same
-name is what the new ratios are shown beside.
+name is what the new ratios are shown beside, and keeps the parts that are not measured again.
 """
 
 import argparse
@@ -175,13 +175,25 @@ def measure(options: argparse.Namespace) -> dict[str, Timings]:
     return found
 
 
-def table(found: dict[str, Timings], before: dict[str, Any]) -> str:
-    """Markdown: milliseconds with quartiles, and how many times faster than the published peer."""
+def stored(part: dict[str, Any]) -> Timings:
+    """Timings of an earlier run, from its JSON."""
+    timings = {}
+    for name, entry in part.items():
+        low, high = entry.get("quartiles", [entry["ms"]] * 2)
+        timings[name] = Timing(entry["ms"] / 1e3, low / 1e3, high / 1e3)
+    return timings
+
+
+def table(found: dict[str, Timings], before: dict[str, Any], *, fresh: set[str]) -> str:
+    """Markdown: milliseconds with quartiles, and how many times faster than the published peer.
+
+    The last column has the ratio of an earlier run, for the parts that were measured again.
+    """
     lines = ["| | variant | ms [quartiles] | ratio | before |", "|---|---|--:|--:|--:|"]
     for title, timings in found.items():
         for name, timing in timings.items():
             ratio = timings[PEER].median / timing.median
-            old = before.get(title, {}).get(name, {}).get("ratio")
+            old = before.get(title, {}).get(name, {}).get("ratio") if title in fresh else None
             earlier = f"{old:.2f}" if old else ""
             lines.append(f"| {title} | {name} | {timing} | {ratio:.2f} | {earlier} |")
     return "\n".join(lines)
@@ -234,16 +246,21 @@ def main() -> None:
     file = RESULTS / f"{name}.json"
     before = json.loads(file.read_text())["parts"] if file.is_file() else {}
     found = measure(options)
-    text = table(found, before)
+    everything = {**{title: stored(part) for title, part in before.items()}, **found}
+    text = table(everything, before, fresh=set(found))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"{text}\n\n{options.threads} threads, scale={options.scale}, {options.device}")
     print(f"peak resident memory of all together {peak:.1f} GiB")
     parts = {
         title: {
-            name: {"ms": timing.median * 1e3, "ratio": timings[PEER].median / timing.median}
+            name: {
+                "ms": timing.median * 1e3,
+                "quartiles": [timing.low * 1e3, timing.high * 1e3],
+                "ratio": timings[PEER].median / timing.median,
+            }
             for name, timing in timings.items()
         }
-        for title, timings in found.items()
+        for title, timings in everything.items()
     }
     RESULTS.mkdir(exist_ok=True)
     machine = {
@@ -254,9 +271,9 @@ def main() -> None:
     }
     if options.device == "cuda":
         machine["gpu"] = torch.cuda.get_device_name()
-    file.write_text(json.dumps({"machine": machine, "parts": {**before, **parts}}, indent=1) + "\n")
+    file.write_text(json.dumps({"machine": machine, "parts": parts}, indent=1) + "\n")
     file.with_suffix(".md").write_text(text + "\n")
-    plot(found, file.with_suffix(".png"))
+    plot(everything, file.with_suffix(".png"))
 
 
 if __name__ == "__main__":

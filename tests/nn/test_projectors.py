@@ -220,6 +220,17 @@ def test_wrong_map_is_refused():
         PooledProjector(2, 3, map_size=8)(torch.zeros(1, 2, 9, 9))
 
 
+@pytest.mark.parametrize("sigma", [0.05, 0.2, 0.8])
+def test_narrow_gaussians_leave_no_denormal_weights(sigma):
+    points = icosahedron(1).visible_xy
+    positions = sampling_positions(points, 8, coverage=0.9, projector_axes="raster")
+    weights = sampling_weights(positions, 8, sigma)
+    single = weights.float()
+    assert not ((single > 0) & (single < torch.finfo(torch.float32).tiny)).any()
+    assert (single >= 0).all()
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(16).double(), rtol=0, atol=1e-12)
+
+
 def test_weights_are_a_gaussian():
     weights = sampling_weights(torch.tensor([[1.0, 2.5]]), 4, 0.7).view(4, 4)
     row, column = 2, 1

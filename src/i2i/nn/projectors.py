@@ -35,6 +35,9 @@ def sampling_positions(
     return map_size / 2 + 0.5 * map_size * coverage * torch.stack([row, column], dim=1)
 
 
+_NEGLIGIBLE = torch.finfo(torch.float32).eps ** 2  # of weights that sum to 1
+
+
 def sampling_weights(positions: Tensor, map_size: int, sigma_cells: float) -> Tensor:
     """Gaussian weights of all cells for each position, each row summing to 1: (V, S·S).
 
@@ -49,7 +52,10 @@ def sampling_weights(positions: Tensor, map_size: int, sigma_cells: float) -> Te
         centres[None, None, :] - column[:, None, None]
     ) ** 2
     # Softmax of the exponents: a narrow sigma cannot underflow to 0/0.
-    return torch.softmax(-squared.flatten(1) / (2 * sigma_cells**2), dim=1)
+    weights = torch.softmax(-squared.flatten(1) / (2 * sigma_cells**2), dim=1)
+    # The far tail is below any rounding, but as denormal numbers it makes a CPU's products many
+    # times slower.
+    return weights.masked_fill(weights < _NEGLIGIBLE, 0.0)
 
 
 class SamplingProjector(nn.Module):
