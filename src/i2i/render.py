@@ -1,12 +1,17 @@
 """Render a dataset into its store: `python -m i2i.render data=meshes data.root=my_parts`."""
 
+import sys
+import traceback
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from i2i.cli import door
+from i2i.cli import door, given_overrides
 from i2i.configuration import register_resolvers
-from i2i.data.datamodule import RenderedDataModule
-from i2i.errors import ConfigurationError
-from i2i.runs.building import build_datamodule
+from i2i.errors import I2IError
+from i2i.render_jobs import what_to_render
+from i2i.sweeping import one_line
 
 
 def render(cfg: DictConfig) -> list[str]:
@@ -16,19 +21,35 @@ def render(cfg: DictConfig) -> list[str]:
         cfg: The composed configuration of this door.
 
     Returns:
-        The folders of the stores.
+        The folders of the stores; of a part they may not be there yet.
+
+    Raises:
+        ConfigurationError: if there is nothing to render, or no such part.
+        I2IError: see `i2i.data.rendering_job.render_store`.
     """
     register_resolvers()
-    datamodule = build_datamodule(cfg)
-    if not isinstance(datamodule, RenderedDataModule):
-        raise ConfigurationError(f"data={cfg.data.name} has no meshes: there is nothing to render")
-    return [str(path) for path in datamodule.render(overwrite=cfg.overwrite).values()]
+    datamodule, part = what_to_render(cfg)
+    return [str(path) for path in datamodule.render(overwrite=cfg.overwrite, part=part).values()]
 
 
 @door("render")
 def main(cfg: DictConfig) -> None:
     """Render the views of a dataset."""
-    for path in render(cfg):
+    in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
+    if in_sweep:
+        print(f"\njob {HydraConfig.get().job.num}: {' '.join(given_overrides())}", flush=True)
+    try:
+        paths = render(cfg)
+    except Exception as error:
+        if in_sweep:  # the sweep's end tells the reason too, but not in this job's log
+            if not isinstance(error, I2IError | ValueError | OSError):
+                traceback.print_exc()
+            print(f"failed: {one_line(error)}", file=sys.stderr, flush=True)
+        raise
+    if cfg.part is not None:
+        print(f"part {cfg.part} of {cfg.parts} rendered; the command without them makes the stores")
+        return
+    for path in paths:
         print(f"store {path}")
 
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.errors import HydraException
@@ -20,6 +21,26 @@ from i2i.runs.sweeps import Job
 
 class JobFailedError(I2IError):
     """A job of a sweep failed; holds the reason only, so that what the job held can be freed."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a door's jobs are to the sweeper. Each function gets a resolved configuration.
+
+    Attributes:
+        identity: Gives a hash; jobs with the same one are one.
+        done: Gives where a finished job's result is, from its hash as well; None if it is not.
+        broken: The same for what an unfinished one left behind and can go on from.
+        left_to_others: Whether a job that another process runs is left to that; else waits for it.
+    """
+
+    identity: Callable[[dict[str, Any]], str]
+    done: Callable[[dict[str, Any], str], Path | None]
+    broken: Callable[[dict[str, Any], str], Path | None]
+    left_to_others: bool
+
+
+TRAINING = Rules(config_hash, find_done, find_broken, left_to_others=True)
 
 
 @dataclass(frozen=True)
@@ -41,12 +62,17 @@ class Planned:
     identity: str
 
 
-def plan(jobs: Iterable[Job], compose: Callable[[Sequence[str]], DictConfig]) -> list[Planned]:
+def plan(
+    jobs: Iterable[Job],
+    compose: Callable[[Sequence[str]], DictConfig],
+    rules: Rules = TRAINING,
+) -> list[Planned]:
     """Find out what is done, broken, new and impossible; jobs of the same identity count once.
 
     Args:
         jobs: Of `i2i.runs.sweeps.expand`.
         compose: Gives a job's configuration without Hydra's own part, from its words.
+        rules: Of the door.
     """
     planned: dict[str, Planned] = {}
     sources: dict[str, Any] = {}
@@ -55,23 +81,24 @@ def plan(jobs: Iterable[Job], compose: Callable[[Sequence[str]], DictConfig]) ->
             cfg = compose(job.overrides)
             config = plain(cfg)
             reason = _left_out(cfg, config, sources)
+            identity = str(config["resume"] or rules.identity(config))
+            if identity not in planned:
+                planned[identity] = _planned(job, config, identity, reason, rules)
         except Exception as error:  # one job that makes no sense stops no other
             planned[str(job)] = Planned(job, "failed", one_line(error), {}, "")
-            continue
-        identity = str(config["resume"] or config_hash(config))
-        if identity not in planned:
-            planned[identity] = _planned(job, config, identity, reason)
     return list(planned.values())
 
 
-def _planned(job: Job, config: dict[str, Any], identity: str, reason: str | None) -> Planned:
+def _planned(
+    job: Job, config: dict[str, Any], identity: str, reason: str | None, rules: Rules
+) -> Planned:
     if reason:
         return Planned(job, "left out", reason, config, identity)
     if config["resume"]:  # that run's own configuration counts, not what is composed here
         return Planned(job, "continue", identity, config, identity)
-    if done := find_done(config, identity):
+    if done := rules.done(config, identity):
         return Planned(job, "done", str(done), config, identity)
-    if broken := find_broken(config, identity):
+    if broken := rules.broken(config, identity):
         return Planned(job, "continue", str(broken), config, identity)
     return Planned(job, "start", "", config, identity)
 
@@ -118,12 +145,13 @@ def tell_plan(planned: Sequence[Planned]) -> None:
     sys.stdout.flush()
 
 
-def tell_end(planned: Sequence[Planned], failures: dict[str, str]) -> bool:
+def tell_end(planned: Sequence[Planned], failures: dict[str, str], rules: Rules = TRAINING) -> bool:
     """Print what came out of the jobs that were launched or could not be.
 
     Args:
         planned: All jobs.
         failures: Reason by identity of the jobs that failed.
+        rules: Of the door.
 
     Returns:
         Whether all went well.
@@ -131,7 +159,7 @@ def tell_end(planned: Sequence[Planned], failures: dict[str, str]) -> bool:
     shown = _distinguishing([p.job for p in planned])
     launched = [p for p in planned if p.state in ("continue", "start")]
     quiet = [p for p in launched if p.identity not in failures and not p.config["resume"]]
-    elsewhere = [p for p in quiet if not find_done(p.config, p.identity)]
+    elsewhere = [p for p in quiet if rules.left_to_others and not rules.done(p.config, p.identity)]
     failed = [(p.job, failures[p.identity]) for p in launched if p.identity in failures]
     done = len(launched) - len(elsewhere) - len(failed)
     failed += [(p.job, p.why) for p in planned if p.state == "failed"]

@@ -15,6 +15,7 @@ from render_fakes import FakeRenderer, FakeSource, folder_bytes
 
 import i2i.data.render_worker as render_worker
 import i2i.data.rendering_job as rendering_job
+from i2i.data.render_guards import locked
 from i2i.data.rendering_job import render_store
 from i2i.data.store import RenderedStore
 from i2i.errors import MeshError, StoreError, StoreMismatchError
@@ -132,6 +133,7 @@ SCRIPT = """
 import sys
 sys.path.insert(0, {tests!r})
 from render_fakes import FakeRenderer, FakeSource
+from i2i.data.render_guards import locked
 from i2i.data.rendering_job import render_store
 if __name__ == "__main__":
     source = FakeSource(kill_at="can_01")
@@ -285,3 +287,35 @@ def test_a_repaired_mesh_is_rendered_by_the_same_command(tmp_path):
     assert first == second
     assert [entry["id"] for entry in card["items"]] == ["box_00", "box_01", "box_02"]
     assert card["skipped"] == []
+
+
+def test_parts_are_put_together_by_who_renders_all(tmp_path, expected):
+    source = FakeSource(broken=["box_01"])
+    whole = render(tmp_path / "whole", source)
+    for number in (1, 2, 3, 4, 5, 6, 7, 8, 9, 10):  # the last one has no object
+        render(tmp_path / "now", source, part=(number, 10))
+    assert not list(tmp_path.glob("now/**/card.json"))
+    assert render(tmp_path / "now", source).keys() == whole.keys()
+    assert folder_bytes(tmp_path / "now") == folder_bytes(tmp_path / "whole") != expected
+
+
+@pytest.mark.parametrize(
+    ("held", "wanted", "waits"),
+    [
+        (None, None, True), (None, (1, 2), True), ((1, 2), None, True),
+        ((1, 2), (1, 2), True), ((1, 2), (2, 2), False),
+    ],
+)  # fmt: skip
+def test_different_parts_go_on_at_once_and_all_else_waits(tmp_path, held, wanted, waits):
+    script = (
+        "import sys; from pathlib import Path; from i2i.data.render_guards import locked\n"
+        f"with locked([Path({str(tmp_path)!r}, 'box')], {wanted!r}): print('in', flush=True)"
+    )
+    with locked([tmp_path / "can", tmp_path / "box"], held):
+        other = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+        if waits:
+            with pytest.raises(subprocess.TimeoutExpired):
+                other.wait(3)
+        else:
+            assert other.wait(60) == 0
+    assert other.communicate(timeout=60)[0] == "in\n"

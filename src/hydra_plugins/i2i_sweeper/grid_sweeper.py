@@ -18,7 +18,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 if TYPE_CHECKING:
-    from i2i.sweeping import Planned
+    from i2i.sweeping import Planned, Rules
 
 
 class GridSweeper(Sweeper):
@@ -27,11 +27,17 @@ class GridSweeper(Sweeper):
     Args:
         grids: Each a dict of key → value or list of values (`i2i.runs.sweeps`); none for the
             combinations of what is typed.
+        rules: Where the door's `i2i.sweeping.Rules` are, as a dotted path.
     """
 
-    def __init__(self, grids: Sequence[Mapping[str, Any]] | None = None) -> None:
+    def __init__(
+        self,
+        grids: Sequence[Mapping[str, Any]] | None = None,
+        rules: str = "i2i.sweeping.TRAINING",
+    ) -> None:
         super().__init__()
         self.grids = grids or []
+        self.rules = rules
         self.config: DictConfig | None = None
         self.context: HydraContext | None = None
         self.launcher: Launcher | None = None
@@ -50,20 +56,24 @@ class GridSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> Any:  # noqa: ANN401 - as Hydra declares it
         """Launch the jobs that are left to do; exit with status 1 if one of them fails."""
+        from hydra.utils import get_object
+
         from i2i.runs.sweeps import expand
         from i2i.sweeping import plan, tell_end, tell_plan
 
         assert self.context is not None
+        rules: Rules = get_object(self.rules)
         loader = self.context.config_loader
         grids = OmegaConf.to_container(OmegaConf.create(list(self.grids)), resolve=True)
-        planned = plan(expand(grids, arguments, config_loader=loader), self._compose)  # type: ignore[arg-type]
+        jobs = expand(grids, arguments, config_loader=loader)  # type: ignore[arg-type]
+        planned = plan(jobs, self._compose, rules)
         tell_plan(planned)
         launch = [p for p in planned if p.state in ("continue", "start")]
         returns: Sequence[JobReturn] = []
         failures: dict[str, str] = {}
         if launch:
-            returns, failures = self._launch(launch)
-        if not tell_end(planned, failures):
+            returns, failures = self._launch(launch, rules)
+        if not tell_end(planned, failures, rules):
             sys.exit(1)
         return returns
 
@@ -76,9 +86,10 @@ class GridSweeper(Sweeper):
             del cfg["hydra"]
         return cfg
 
-    def _launch(self, launch: list[Planned]) -> tuple[Sequence[JobReturn], dict[str, str]]:
+    def _launch(
+        self, launch: list[Planned], rules: Rules
+    ) -> tuple[Sequence[JobReturn], dict[str, str]]:
         """Run jobs; gives what the launcher gave, and reasons by identity."""
-        from i2i.runs.progress import find_done
         from i2i.sweeping import one_line
 
         assert self.launcher is not None
@@ -90,8 +101,8 @@ class GridSweeper(Sweeper):
             print("sweep stopped; the same command again goes on", file=sys.stderr)
             raise
         except Exception as error:  # a process died: what the others did is on the disk
-            reason = f"the launcher gave up: {one_line(error)}"
-            left = [p.identity for p in launch if not find_done(p.config, p.identity)]
+            reason = f"the launcher gave up, jobs may still run: {one_line(error)}"
+            left = [p.identity for p in launch if not rules.done(p.config, p.identity)]
             return [], dict.fromkeys(left, reason)
         failures = {
             planned.identity: one_line(returned._return_value)

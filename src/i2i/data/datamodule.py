@@ -17,7 +17,7 @@ from i2i.data.dataset import ImageBlock
 from i2i.data.info import CHANNELS, CLOUDS, DataInfo
 from i2i.data.loaders import ImageDataModule, LoaderSettings, SplitData
 from i2i.data.reference import reference_meshes
-from i2i.data.rendering_job import StorePaths, render_store
+from i2i.data.rendering_job import StorePaths, is_rendered, render_store
 from i2i.data.settings import store_settings
 from i2i.data.sources.base import MeshItem, MeshSource, override_symmetry
 from i2i.data.splits import Splits, class_modes, split_items
@@ -209,12 +209,19 @@ class RenderedDataModule(ImageDataModule):
         """Render what the stores lack."""
         self.render()
 
-    def render(self, *, overwrite: bool = False, progress: bool = True) -> StorePaths:
+    def render(
+        self,
+        *,
+        overwrite: bool = False,
+        progress: bool = True,
+        part: tuple[int, int] | None = None,
+    ) -> StorePaths:
         """Render what the stores lack.
 
         Args:
             overwrite: Render again what is there.
             progress: Show the progress.
+            part: See `render_store`.
 
         Returns:
             Folder of the store of each (class name, split).
@@ -222,19 +229,37 @@ class RenderedDataModule(ImageDataModule):
         Raises:
             I2IError: see `render_store`.
         """
-        # Classes that are split by view have the same objects in train and val.
-        train = list(dict.fromkeys([*self.items["train"], *self.items["val"]]))
         return render_store(
             self.source,
-            {"train": train, "test": self.items["test"]},
+            self._stored_items(),
             views_per_instance=self.views,
             root=self.store_root,
             num_workers=self.render_workers,
             strict=self.strict,
             overwrite=overwrite,
             progress=progress,
+            part=part,
             **self._making,
         )
+
+    def is_rendered(self, part: tuple[int, int] | None = None) -> bool:
+        """Whether `render` would find all of it, or of a part, there.
+
+        Raises:
+            I2IError: if the meshes are not there, or the stores were made with other settings.
+        """
+        return is_rendered(
+            self._stored_items(),
+            self.settings,
+            views_per_instance=self.views,
+            root=self.store_root,
+            part=part,
+        )
+
+    def _stored_items(self) -> dict[str, list[MeshItem]]:
+        # Classes that are split by view have the same objects in train and val.
+        train = list(dict.fromkeys([*self.items["train"], *self.items["val"]]))
+        return {"train": train, "test": self.items["test"]}
 
     def reference_mesh(self, class_name: str) -> RenderMesh | None:
         """A typical training object of a class, for drawing."""

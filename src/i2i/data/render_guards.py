@@ -7,9 +7,10 @@ import errno
 import logging
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import IO
 
 from i2i.errors import StoreError
 
@@ -17,23 +18,38 @@ log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def locked(base: Path) -> Iterator[None]:
-    """Hold the lock of all stores with the same settings; wait if another process has it."""
-    base.mkdir(parents=True, exist_ok=True)
+def locked(folders: Iterable[Path], part: tuple[int, int] | None = None) -> Iterator[None]:
+    """Hold the locks of the stores in some folders; wait for those that another process has.
+
+    Args:
+        folders: Folders of classes, made when missing.
+        part: Number and count of the part that is rendered. Different parts of a class go on at
+            once; who wants all of it waits for them, and they for it. None for all of it.
+    """
+    with contextlib.ExitStack() as stack:
+        for folder in sorted(folders):  # everybody in the same order, or two wait for each other
+            folder.mkdir(parents=True, exist_ok=True)
+            # Reading and writing, as NFS wants it for a lock that is shared.
+            _lock(stack.enter_context((folder / ".lock").open("a+")), folder, shared=bool(part))
+            if part is not None:
+                own = folder / f".lock-{part[0]}-of-{part[1]}"
+                _lock(stack.enter_context(own.open("a+")), folder, shared=False)
+        yield  # closing the files releases the locks, and so does the end of the process
+
+
+def _lock(stream: IO[str], folder: Path, *, shared: bool) -> None:
     try:
         import fcntl
     except ImportError:  # no such locks on this system; unique names and renames still hold
-        yield
         return
-    with (base / ".lock").open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            log.info("Another process renders %s; waiting for it.", base)
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        except OSError:
-            log.warning("%s is on a file system without locks; render from one process.", base)
-        yield  # closing the file releases the lock, and so does the end of the process
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(stream, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        log.info("Another process renders %s; waiting for it.", folder)
+        fcntl.flock(stream, kind)
+    except OSError:
+        log.warning("%s is on a file system without locks; render from one process.", folder)
 
 
 @contextlib.contextmanager

@@ -263,10 +263,15 @@ def _light_start(context: RenderContext) -> Iterator[None]:
     os.environ.update(dict.fromkeys(threads, "1"))
     if not needs_main:
         sys.modules["__main__"] = types.ModuleType("__main__")
+    joblib = multiprocessing.get_start_method(allow_none=True) == "loky"
+    if joblib:  # its own way of starting processes, which a spawned one would not know
+        multiprocessing.set_start_method(None, force=True)
     try:
         yield
     finally:
         sys.modules["__main__"] = main
+        if joblib:
+            multiprocessing.set_start_method("loky", force=True)
         for name, value in threads.items():
             if value is None:
                 os.environ.pop(name, None)

@@ -63,6 +63,7 @@ class _Plan:
         fingerprints: Of each object asked for.
         chunks: Tasks, by instance.
         items: Objects of the tasks, by instance.
+        whole: Whether its objects are all that are asked for, not a part of them.
         failed: Reasons of the objects that cannot be used, by instance.
         pending: Tasks that are not finished.
     """
@@ -70,6 +71,7 @@ class _Plan:
     folder: Path
     class_name: str
     split: str
+    whole: bool = True
     card: dict[str, Any] | None = None
     fingerprints: dict[str, str] = field(default_factory=dict)
     chunks: dict[str, list[Chunk]] = field(default_factory=dict)
@@ -101,6 +103,7 @@ def render_store(
     strict: bool = False,
     overwrite: bool = False,
     progress: bool = True,
+    part: tuple[int, int] | None = None,
 ) -> StorePaths:
     """Make what the stores lack of some objects and views; nothing if they have it all.
 
@@ -121,13 +124,15 @@ def render_store(
         num_points: See `store_settings`, as for the next two.
         camera_set: See `store_settings`.
         cloud_image_size: See `store_settings`.
-        num_workers: Processes; None for one per processor, 0 for this one.
+        num_workers: Processes; None for one per processor that may be used, 0 for this one.
         strict: Stop at the first mesh that cannot be read, instead of leaving it out.
         overwrite: Render again what is there.
         progress: Show a bar on a terminal, else log lines.
+        part: ``(2, 8)`` for the second eighth of the objects: their views are rendered and kept
+            beside the stores, and who renders all of them finds them there. None for all.
 
     Returns:
-        Folder of the store of each (class name, split).
+        Folder of the store of each (class name, split); of a part it may not be there yet.
 
     Raises:
         StoreMismatchError: if a store was made with other settings or from other meshes.
@@ -146,43 +151,68 @@ def render_store(
         cloud_image_size=cloud_image_size,
     )
 
-    def plans(*, fresh: bool) -> list[_Plan]:
-        groups = _group(items, settings, root)
-        return [
-            _plan(plan, members, settings, views_per_instance[plan.split], fresh=fresh)
-            for plan, members in groups
-        ]
+    def plans() -> list[_Plan]:
+        return _plans(items, settings, root, views_per_instance, fresh=overwrite, part=part)
 
-    todo = plans(fresh=overwrite)
+    todo = plans()
     if any(plan.chunks for plan in todo):
         base = Path(root) / settings.source / settings.key
         # Here, and not in each process: the camera sets need torch.
         cameras = None if camera_set is None else camera_rotations(camera_set)
         context = RenderContext(source, renderer, settings, cameras)
-        with disk_errors(base), locked(base):
+        with disk_errors(base), locked({plan.folder.parent for plan in todo}, part):
             # Another process may have rendered all of it while this one waited for the lock.
-            for plan in todo:
-                recover(plan.folder)
-                if overwrite:
-                    shutil.rmtree(plan.chunk_folder, ignore_errors=True)
-            todo = plans(fresh=overwrite)
+            if part is None:
+                for plan in todo:
+                    recover(plan.folder)
+                    if overwrite:
+                        shutil.rmtree(plan.chunk_folder, ignore_errors=True)
+            todo = plans()
             _run(context, todo, _worker_count(num_workers), strict=strict, progress=progress)
-    _check_skipped(todo, items, strict=strict)
+    _check_skipped(todo, strict=strict)
     return {(plan.class_name, plan.split): plan.folder for plan in todo}
 
 
-def _group(
-    items: Mapping[str, Sequence[MeshItem]], settings: StoreSettings, root: str | os.PathLike[str]
-) -> list[tuple[_Plan, list[MeshItem]]]:
-    """Empty plans with their objects, one for each class and split."""
+def is_rendered(
+    items: Mapping[str, Sequence[MeshItem]],
+    settings: StoreSettings,
+    *,
+    views_per_instance: Mapping[str, int],
+    root: str | os.PathLike[str],
+    part: tuple[int, int] | None = None,
+) -> bool:
+    """Whether `render_store` would find all of some objects and views there.
+
+    Raises:
+        StoreMismatchError: as `render_store`.
+    """
+    todo = _plans(items, settings, root, views_per_instance, fresh=False, part=part)
+    chunks = [chunk for plan in todo for group in plan.chunks.values() for chunk in group]
+    return not chunks if part is None else all(read_chunk(chunk) is not None for chunk in chunks)
+
+
+def _plans(
+    items: Mapping[str, Sequence[MeshItem]],
+    settings: StoreSettings,
+    root: str | os.PathLike[str],
+    views: Mapping[str, int],
+    *,
+    fresh: bool,
+    part: tuple[int, int] | None,
+) -> list[_Plan]:
+    """What each store lacks, one plan for each class and split."""
+    number, count = part or (1, 1)
     groups: dict[tuple[str, str], list[MeshItem]] = {}
     for split, members in items.items():
-        for item in members:
+        for item in members[number - 1 :: count]:
             groups.setdefault((item.class_name, split), []).append(item)
     return [
-        (_Plan(settings.folder(root, name, split), name, split), members)
+        _plan(
+            _Plan(settings.folder(root, name, split), name, split, whole=part is None),
+            members, settings, views[split], fresh=fresh,
+        )
         for (name, split), members in groups.items()
-    ]
+    ]  # fmt: skip
 
 
 def _plan(
@@ -267,7 +297,7 @@ def _finish(
         if len(plan.failed) <= MAX_WARNINGS:
             log.warning("Skipped mesh %s/%s: %s", plan.class_name, name, reason)
     plan.pending -= 1
-    if plan.pending == 0:
+    if plan.pending == 0 and plan.whole:
         if len(plan.failed) > MAX_WARNINGS:
             log.warning("Skipped %d meshes of %s in all.", len(plan.failed), plan.class_name)
         _assemble(context, plan)
@@ -341,14 +371,12 @@ def _chunk_data(chunk: Chunk) -> ChunkData:
     return data
 
 
-def _check_skipped(
-    plans: Sequence[_Plan], items: Mapping[str, Sequence[MeshItem]], *, strict: bool
-) -> None:
+def _check_skipped(plans: Sequence[_Plan], *, strict: bool) -> None:
     """Raise if meshes were skipped now or earlier and that is not acceptable."""
     for plan in plans:
         if plan.failed and strict:
             raise MeshError(_unreadable(plan, sorted(plan.failed)) + " (strict=true)")
-        if set(plan.fingerprints) <= set(plan.failed):
+        if plan.whole and set(plan.fingerprints) <= set(plan.failed):
             raise MeshError(_unreadable(plan, sorted(plan.failed)) + " None of them is left.")
 
 
@@ -364,4 +392,8 @@ def _unreadable(plan: _Plan, names: Sequence[str]) -> str:
 def _worker_count(num_workers: int | None) -> int:
     if num_workers is not None and num_workers < 0:
         raise ValueError(f"data.render_workers={num_workers} is not allowed: give 0 or more.")
-    return os.cpu_count() or 1 if num_workers is None else num_workers
+    if num_workers is not None:
+        return num_workers
+    if hasattr(os, "sched_getaffinity"):  # a job of a cluster has a few of the node's processors
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
