@@ -179,7 +179,7 @@ def stored(part: dict[str, Any]) -> Timings:
     """Timings of an earlier run, from its JSON."""
     timings = {}
     for name, entry in part.items():
-        low, high = entry.get("quartiles", [entry["ms"]] * 2)
+        low, high = entry["quartiles"]
         timings[name] = Timing(entry["ms"] / 1e3, low / 1e3, high / 1e3)
     return timings
 
@@ -244,7 +244,18 @@ def main() -> None:
     ending = "" if options.device == "cpu" else f"_{options.device}"
     name = options.name or f"network_speed_{options.scale}{ending}"
     file = RESULTS / f"{name}.json"
-    before = json.loads(file.read_text())["parts"] if file.is_file() else {}
+    machine = {
+        "processor": platform.machine(),
+        "torch": torch.__version__,
+        "threads": options.threads,
+        "capability": torch.backends.cpu.get_cpu_capability(),
+    }
+    if options.device == "cuda":
+        machine["gpu"] = torch.cuda.get_device_name()
+    old = json.loads(file.read_text()) if file.is_file() else {"machine": machine, "parts": {}}
+    if old["machine"] != machine:
+        print(f"the earlier results are of another machine and are replaced: {old['machine']}")
+    before = old["parts"] if old["machine"] == machine else {}
     found = measure(options)
     everything = {**{title: stored(part) for title, part in before.items()}, **found}
     text = table(everything, before, fresh=set(found))
@@ -263,14 +274,6 @@ def main() -> None:
         for title, timings in everything.items()
     }
     RESULTS.mkdir(exist_ok=True)
-    machine = {
-        "processor": platform.machine(),
-        "torch": torch.__version__,
-        "threads": options.threads,
-        "capability": torch.backends.cpu.get_cpu_capability(),
-    }
-    if options.device == "cuda":
-        machine["gpu"] = torch.cuda.get_device_name()
     file.write_text(json.dumps({"machine": machine, "parts": parts}, indent=1) + "\n")
     file.with_suffix(".md").write_text(text + "\n")
     plot(everything, file.with_suffix(".png"))

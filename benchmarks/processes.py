@@ -38,7 +38,7 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     if processes > 1:
         meeting = f"file://{folder}/meeting"
         distributed.init_process_group("gloo", meeting, rank=rank, world_size=processes)
-        model = DistributedDataParallel(model, gradient_as_bucket_view=True)
+        model = DistributedDataParallel(model)
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-4, momentum=0.9, nesterov=True)
     seconds, losses = [], []
     for step in range(options.warm_up + options.steps):

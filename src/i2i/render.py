@@ -1,17 +1,13 @@
 """Render a dataset into its store: `python -m i2i.render data=meshes data.root=my_parts`."""
 
-import sys
-import traceback
-
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from i2i.cli import door, given_overrides
+from i2i.cli import door
 from i2i.configuration import register_resolvers
-from i2i.errors import I2IError
 from i2i.render_jobs import what_to_render
-from i2i.sweeping import one_line
+from i2i.sweeping import run_job
 
 
 def render(cfg: DictConfig) -> list[str]:
@@ -35,17 +31,14 @@ def render(cfg: DictConfig) -> list[str]:
 @door("render")
 def main(cfg: DictConfig) -> None:
     """Render the views of a dataset."""
-    in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
-    if in_sweep:
-        print(f"\njob {HydraConfig.get().job.num}: {' '.join(given_overrides())}", flush=True)
-    try:
-        paths = render(cfg)
-    except Exception as error:
-        if in_sweep:  # the sweep's end tells the reason too, but not in this job's log
-            if not isinstance(error, I2IError | ValueError | OSError):
-                traceback.print_exc()
-            print(f"failed: {one_line(error)}", file=sys.stderr, flush=True)
-        raise
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        run_job(lambda: _render_and_tell(cfg))
+    else:
+        _render_and_tell(cfg)
+
+
+def _render_and_tell(cfg: DictConfig) -> None:
+    paths = render(cfg)
     if cfg.part is not None:
         print(f"part {cfg.part} of {cfg.parts} rendered; the command without them makes the stores")
         return

@@ -1,16 +1,21 @@
 """What the sweeper does before and after a launcher: what is left to do, and what came out."""
 
+import gc
+import multiprocessing
+import os
 import sys
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from i2i.cli import readable
+from i2i.cli import given_overrides, readable
 from i2i.configuration import plain
 from i2i.errors import ConfigurationError, DatasetNotFoundError, I2IError
 from i2i.runs.building import check_fit
@@ -187,6 +192,35 @@ def _tell_reasons(
         print(f"{words}: {reason}")
         for job in jobs:
             print(f"  {shown(job)}")
+
+
+def run_job(work: Callable[[], None], *, clean: Callable[[], object] = gc.collect) -> None:
+    """Run one job of a sweep, and leave nothing of it in this process, which may have others.
+
+    Args:
+        work: The job.
+        clean: Called after it, whatever came out.
+
+    Raises:
+        JobFailedError: with the reason alone: a traceback would keep alive what the job held.
+    """
+    words = [word for word in given_overrides() if not word.startswith("experiment=")]
+    print(f"\njob {HydraConfig.get().job.num}: {' '.join(words)}", flush=True)
+    if multiprocessing.get_start_method(allow_none=True) == "loky":
+        # Joblib's processes cannot start others in its own way, as rendering must.
+        multiprocessing.set_start_method(None, force=True)
+    reason = ""
+    try:
+        work()
+    except Exception as error:
+        reason = one_line(error)
+        expected = isinstance(error, I2IError | ValueError | OSError)
+        if not expected or "HYDRA_FULL_ERROR" in os.environ:
+            traceback.print_exc()
+    clean()
+    if reason:
+        print(f"failed: {reason}", file=sys.stderr, flush=True)
+        raise JobFailedError(reason)
 
 
 def one_line(error: BaseException) -> str:

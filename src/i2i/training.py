@@ -2,11 +2,9 @@
 
 import gc
 import logging
-import multiprocessing
 import os
 import shlex
 import sys
-import traceback
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,6 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
@@ -28,7 +25,7 @@ from i2i.callbacks.steps import StopAfterSteps
 from i2i.cli import given_overrides, refuse
 from i2i.configuration import plain, register_resolvers
 from i2i.data.loaders import ImageDataModule
-from i2i.errors import ConfigurationError, I2IError, NonFiniteLossError
+from i2i.errors import ConfigurationError, NonFiniteLossError
 from i2i.finishing import finish
 from i2i.nn.c4_dispatch import convolution_mode
 from i2i.runs.building import build_datamodule, build_task, follow_root
@@ -38,7 +35,7 @@ from i2i.runs.loading import load_weights, read_checkpoint
 from i2i.runs.locks import holder, job_lock
 from i2i.runs.progress import find_broken, find_done
 from i2i.runs.saving import AtomicCheckpointIO
-from i2i.sweeping import JobFailedError, one_line
+from i2i.sweeping import run_job
 from i2i.tasks.base import Task
 
 log = logging.getLogger(__name__)
@@ -186,14 +183,16 @@ def _check_processes(cfg: DictConfig, trainer: Trainer) -> None:
     if cfg.trainer.get("sync_batchnorm"):
         raise ConfigurationError(
             "trainer.sync_batchnorm=true would replace batch norms that know C4 fields; those of "
-            "i2i share their statistics over processes already. Leave it out"
+            "i2i share their statistics over processes already. Leave it out; parts of your own "
+            "take i2i.nn.batch_norm.JointBatchNorm2d"
         )
     if trainer.world_size > 1 and _in_sweep():
         raise ConfigurationError(
             f"a sweep (-m) with {trainer.world_size} processes a job: every extra process would "
             "start the whole sweep again. Use trainer.devices=1"
         )
-    if isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
+    # By name: the class is Lightning's own business.
+    if "_MultiProcessingLauncher" in [c.__name__ for c in type(trainer.strategy.launcher).__mro__]:
         raise ConfigurationError(
             "trainer.strategy with spawn or fork: its processes end with the test and take the "
             "predictions with them. Use trainer.strategy=ddp"
@@ -293,37 +292,18 @@ def _print_metrics(metrics: dict[str, float], run_dir: Path) -> None:
         print(f"figure {figure}")
 
 
-def _job_of_a_sweep(cfg: DictConfig) -> None:
-    """Run one job, and leave nothing of it in this process, which may have others to run.
+def _train_one(cfg: DictConfig) -> None:
+    result = train_in_sweep(cfg)
+    if result is not None:
+        _print_metrics(result.metrics, result.run_dir)
 
-    Raises:
-        JobFailedError: with the reason alone: a traceback would keep alive what the job held.
-    """
-    words = [word for word in given_overrides() if not word.startswith("experiment=")]
-    print(f"\njob {HydraConfig.get().job.num}: {' '.join(words)}", flush=True)
-    if multiprocessing.get_start_method(allow_none=True) == "loky":
-        # Joblib's processes cannot start others in its own way, as rendering must.
-        multiprocessing.set_start_method(None, force=True)
-    reason = ""
-    try:
-        result = train_in_sweep(cfg)
-        if result is not None:
-            _print_metrics(result.metrics, result.run_dir)
-    except Exception as error:
-        reason = one_line(error)
-        if (
-            not isinstance(error, I2IError | ValueError | OSError)
-            or "HYDRA_FULL_ERROR" in os.environ
-        ):
-            traceback.print_exc()
-    result = None
+
+def _clean() -> None:
+    """Free what the figures and the device of a job hold."""
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
     gc.collect()
     torch.cuda.empty_cache()
-    if reason:
-        print(f"failed: {reason}", file=sys.stderr, flush=True)
-        raise JobFailedError(reason)
 
 
 def refuse_table() -> None:
@@ -345,7 +325,7 @@ def run(cfg: DictConfig) -> None:
     if cfg.print_config:
         print(OmegaConf.to_yaml(cfg, resolve=True))
     if _in_sweep():
-        _job_of_a_sweep(cfg)
+        run_job(lambda: _train_one(cfg), clean=_clean)
         return
     refuse_table()
     result = train(cfg)

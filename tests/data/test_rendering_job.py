@@ -133,7 +133,6 @@ SCRIPT = """
 import sys
 sys.path.insert(0, {tests!r})
 from render_fakes import FakeRenderer, FakeSource
-from i2i.data.render_guards import locked
 from i2i.data.rendering_job import render_store
 if __name__ == "__main__":
     source = FakeSource(kill_at="can_01")
@@ -309,13 +308,16 @@ def test_parts_are_put_together_by_who_renders_all(tmp_path, expected):
 def test_different_parts_go_on_at_once_and_all_else_waits(tmp_path, held, wanted, waits):
     script = (
         "import sys; from pathlib import Path; from i2i.data.render_guards import locked\n"
+        "print('ready', flush=True)\n"
         f"with locked([Path({str(tmp_path)!r}, 'box')], {wanted!r}): print('in', flush=True)"
     )
     with locked([tmp_path / "can", tmp_path / "box"], held):
         other = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+        assert other.stdout.readline() == "ready\n"
         if waits:
             with pytest.raises(subprocess.TimeoutExpired):
                 other.wait(3)
         else:
             assert other.wait(60) == 0
-    assert other.communicate(timeout=60)[0] == "in\n"
+    assert other.wait(60) == 0
+    assert other.stdout.read() == "in\n"

@@ -32,7 +32,7 @@ LAYERS = {
     "torch's own": (nn.BatchNorm2d(3), (6, 3, 4, 5)),
 }
 # Far from zero: E[x²] − mean² would lose its digits here.
-OFFSET = 1e3
+OFFSET = 1e6
 
 
 def layer_cases(dtype):
@@ -74,7 +74,7 @@ def layers(tmp_path_factory):
 def test_two_processes_are_one_with_the_joint_batch(layers, name):
     cases, parts = layers
     theirs = joined([part[name] for part in parts], parameters=sum)  # of sums, not of means
-    torch.testing.assert_close(theirs, layer_step(*cases[name]), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(theirs, layer_step(*cases[name]), rtol=1e-7, atol=1e-7)
 
 
 def test_local_statistics_would_differ(layers):
@@ -91,7 +91,7 @@ def test_running_statistics_are_torchs(momentum):
         x = torch.randn(4, 3, 5, 5) + 2
         torchs(x)
         var, mean = torch.var_mean(x, (0, 2, 3), correction=0)
-        update_running(ours, mean, var, count=100)
+        update_running(ours, mean, var, count=torch.tensor(100.0))
     torch.testing.assert_close(ours.state_dict(), torchs.state_dict())
 
 

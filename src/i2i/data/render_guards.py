@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -92,3 +93,18 @@ def progress_of(total: int, *, enabled: bool) -> Iterator[Callable[[int], None]]
             log.info("Rendered %d of %d images.", done, total)
 
     yield advance
+
+
+def worker_count(num_workers: int | None) -> int:
+    """How many processes render; None for one per processor that may be used.
+
+    Raises:
+        ValueError: if it is negative.
+    """
+    if num_workers is not None and num_workers < 0:
+        raise ValueError(f"data.render_workers={num_workers} is not allowed: give 0 or more.")
+    if num_workers is not None:
+        return num_workers
+    if hasattr(os, "sched_getaffinity"):  # a job of a cluster has a few of the node's processors
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -196,6 +196,15 @@ def read_chunk(chunk: Chunk) -> ChunkData | None:
         return None
 
 
+def has_chunk(chunk: Chunk) -> bool:
+    """Whether a chunk file is there, of these settings and this mesh; its pixels are not read."""
+    try:
+        with np.load(chunk.path) as stored:
+            return str(stored["tag"]) == chunk.tag
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return False
+
+
 def render_chunks(
     context: RenderContext, chunks: list[Chunk], *, num_workers: int
 ) -> Generator[tuple[Chunk, str | None], None, None]:
@@ -263,15 +272,10 @@ def _light_start(context: RenderContext) -> Iterator[None]:
     os.environ.update(dict.fromkeys(threads, "1"))
     if not needs_main:
         sys.modules["__main__"] = types.ModuleType("__main__")
-    joblib = multiprocessing.get_start_method(allow_none=True) == "loky"
-    if joblib:  # its own way of starting processes, which a spawned one would not know
-        multiprocessing.set_start_method(None, force=True)
     try:
         yield
     finally:
         sys.modules["__main__"] = main
-        if joblib:
-            multiprocessing.set_start_method("loky", force=True)
         for name, value in threads.items():
             if value is None:
                 os.environ.pop(name, None)

@@ -14,16 +14,17 @@ from typing import Any
 
 from i2i.data.content import content_notes, content_of
 from i2i.data.fingerprint import mesh_fingerprint
-from i2i.data.render_guards import disk_errors, locked, progress_of
+from i2i.data.render_guards import disk_errors, locked, progress_of, worker_count
 from i2i.data.render_worker import (
     VIEWS_PER_CHUNK,
     Chunk,
     ChunkData,
     RenderContext,
     chunk_tag,
+    has_chunk,
     read_chunk,
     render_chunks,
-)
+)  # fmt: skip
 from i2i.data.settings import store_settings
 from i2i.data.sources.base import MeshItem, MeshSource
 from i2i.data.store import (
@@ -36,7 +37,7 @@ from i2i.data.store import (
     read_card,
     recover,
     write_store,
-)
+)  # fmt: skip
 from i2i.errors import MeshError, StoreError
 from i2i.geometry.cameras import Camera
 from i2i.geometry.view_sets import camera_rotations
@@ -168,7 +169,7 @@ def render_store(
                     if overwrite:
                         shutil.rmtree(plan.chunk_folder, ignore_errors=True)
             todo = plans()
-            _run(context, todo, _worker_count(num_workers), strict=strict, progress=progress)
+            _run(context, todo, worker_count(num_workers), strict=strict, progress=progress)
     _check_skipped(todo, strict=strict)
     return {(plan.class_name, plan.split): plan.folder for plan in todo}
 
@@ -188,7 +189,7 @@ def is_rendered(
     """
     todo = _plans(items, settings, root, views_per_instance, fresh=False, part=part)
     chunks = [chunk for plan in todo for group in plan.chunks.values() for chunk in group]
-    return not chunks if part is None else all(read_chunk(chunk) is not None for chunk in chunks)
+    return not chunks if part is None else all(map(has_chunk, chunks))
 
 
 def _plans(
@@ -387,13 +388,3 @@ def _unreadable(plan: _Plan, names: Sequence[str]) -> str:
         f"{len(names)} mesh(es) of class {plan.class_name}, split {plan.split}, cannot be used: "
         f"{reasons}{more}. Repair or remove the files and run the same command again."
     )
-
-
-def _worker_count(num_workers: int | None) -> int:
-    if num_workers is not None and num_workers < 0:
-        raise ValueError(f"data.render_workers={num_workers} is not allowed: give 0 or more.")
-    if num_workers is not None:
-        return num_workers
-    if hasattr(os, "sched_getaffinity"):  # a job of a cluster has a few of the node's processors
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -36,7 +36,7 @@ def sum_over_processes(*parts: Tensor) -> tuple[Tensor, ...]:
 
 @torch.no_grad()
 def update_running(
-    norm: nn.BatchNorm1d | nn.BatchNorm2d, mean: Tensor, var: Tensor, *, count: float | Tensor
+    norm: nn.BatchNorm1d | nn.BatchNorm2d, mean: Tensor, var: Tensor, *, count: Tensor
 ) -> None:
     """Running statistics as torch keeps them: with the unbiased variance.
 
@@ -52,7 +52,7 @@ def update_running(
     momentum = norm.momentum
     if momentum is None:
         momentum = 1.0 / float(norm.num_batches_tracked)
-    unbiased = var * (count / torch.as_tensor(count - 1).clamp(min=1))
+    unbiased = var * (count / (count - 1).clamp(min=1))
     norm.running_mean.lerp_(mean.to(norm.running_mean), momentum)
     norm.running_var.lerp_(unbiased.to(norm.running_var), momentum)
 
@@ -104,7 +104,7 @@ def _joint_moments(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     which keeps the digits that E[x²] − mean² would lose.
     """
     var, mean = torch.var_mean(at_least_float32(x), _others(x), correction=0)
-    count = mean.new_full((1,), x.numel() / x.shape[1]).double()
+    count = mean.new_full((1,), x.numel() // x.shape[1], dtype=torch.float64)
     ours = torch.cat([mean.double(), var.double(), count])
     parts = [torch.empty_like(ours) for _ in range(num_processes())]
     distributed.all_gather(parts, ours)

@@ -60,8 +60,7 @@ from i2i.nn.c4_spectral_constants import (
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 __all__ = [
-    "base_filters",
-    "is_supported",
+    "base_filters", "is_supported",
     "product_dtype",
     "spectral_conv2d",
     "spectral_conv2d_base",
@@ -69,7 +68,7 @@ __all__ = [
     "spectral_product",
     "transform_filters",
     "transform_matrix",
-]
+]  # fmt: skip
 
 # Of fields x images: all non-zero orbits (n, 4 C, 4 B), columns (Re, Im at R w; Re, Im at w), and
 # w = 0 (4 C, B). What goes into the blocks has rows (sum|difference, slot, field), what comes out

@@ -9,6 +9,7 @@ from i2i.geometry.icosahedron import MeshAxis, icosahedron
 from i2i.nn.group_conv_variants import READINGS, support_elements
 
 SIGMA_UNITS = ("cell", "halfwidth")
+_NEGLIGIBLE = torch.finfo(torch.float32).eps ** 2  # of weights that sum to 1
 PROJECTOR_AXES = ("raster", "published")
 POOLINGS = ("average", "cells")
 
@@ -33,9 +34,6 @@ def sampling_positions(
     x, y = points[:, 0], points[:, 1]
     row, column = (-y, x) if projector_axes == "raster" else (x, y)
     return map_size / 2 + 0.5 * map_size * coverage * torch.stack([row, column], dim=1)
-
-
-_NEGLIGIBLE = torch.finfo(torch.float32).eps ** 2  # of weights that sum to 1
 
 
 def sampling_weights(positions: Tensor, map_size: int, sigma_cells: float) -> Tensor:
