@@ -35,17 +35,18 @@ LAYERS = {
 OFFSET = 1e6
 
 
-def layer_cases(dtype):
+def layer_cases(dtype, offset):
     torch.manual_seed(0)
     cases = {}
     for name, (layer, shape) in LAYERS.items():
-        module = copy.deepcopy(layer).to(dtype)
+        # Under autocast the parameters stay in float32.
+        module = copy.deepcopy(layer).to(torch.float32 if dtype == torch.bfloat16 else dtype)
         for parameter in module.parameters():
             nn.init.uniform_(parameter, 0.5, 2.0)
         # Another mean and spread in each part, so that local statistics would be wrong.
-        x = torch.randn(shape, dtype=dtype) * 2 + OFFSET
+        x = torch.randn(shape).to(dtype) * 2 + offset
         x[: len(x) // 2] += 3
-        cases[name] = (module, x, torch.randn(shape, dtype=dtype))
+        cases[name] = (module, x, torch.randn(shape).to(dtype))
     return cases
 
 
@@ -66,15 +67,31 @@ def joined(parts, *, parameters):
 
 @pytest.fixture(scope="module")
 def layers(tmp_path_factory):
-    cases = layer_cases(torch.float64)
+    cases = layer_cases(torch.float64, OFFSET)
     return cases, in_processes(layer_in_process, tmp_path_factory.mktemp("layers"), cases)
 
 
-@pytest.mark.parametrize("name", [name for name in LAYERS if name != "torch's own"])
+JOINT = [name for name in LAYERS if name != "torch's own"]
+
+
+@pytest.mark.parametrize("name", JOINT)
 def test_two_processes_are_one_with_the_joint_batch(layers, name):
     cases, parts = layers
     theirs = joined([part[name] for part in parts], parameters=sum)  # of sums, not of means
     torch.testing.assert_close(theirs, layer_step(*cases[name]), rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float32, 2e-5), (torch.bfloat16, 5e-2)])
+def test_lower_precisions_keep_their_dtype_and_its_accuracy(tmp_path, dtype, atol):
+    cases = layer_cases(dtype, offset=1.0)
+    parts = in_processes(layer_in_process, tmp_path, cases)
+    for name in JOINT:
+        theirs = joined([part[name] for part in parts], parameters=sum)
+        assert theirs["out"].dtype == theirs["of x"].dtype == dtype, name
+        module, x, upstream = cases[name]
+        exact = layer_step(module.double(), x.double(), upstream.double())
+        wide = {key: value.double() for key, value in theirs.items()}
+        torch.testing.assert_close(wide, exact, rtol=2e-2 if atol > 1e-3 else 1e-4, atol=atol)
 
 
 def test_local_statistics_would_differ(layers):
