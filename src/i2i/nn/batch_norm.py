@@ -10,28 +10,7 @@ from torch import Tensor, distributed, nn
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from i2i.nn.precision import at_least_float32
-
-
-def num_processes() -> int:
-    """How many processes share a batch."""
-    if not (distributed.is_available() and distributed.is_initialized()):
-        return 1
-    return distributed.get_world_size()
-
-
-def sum_over_processes(*parts: Tensor) -> tuple[Tensor, ...]:
-    """The sums of the tensors of all processes, in one exchange; no gradient passes.
-
-    Args:
-        parts: Tensors of one dtype and device, of the same shapes in every process.
-    """
-    packed = torch.cat([part.detach().flatten() for part in parts])
-    if num_processes() > 1:
-        distributed.all_reduce(packed)
-    sizes = [part.numel() for part in parts]
-    return tuple(
-        flat.view(part.shape) for flat, part in zip(packed.split(sizes), parts, strict=True)
-    )
+from i2i.nn.processes import num_processes, sum_over_processes
 
 
 @torch.no_grad()

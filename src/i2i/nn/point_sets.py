@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from i2i.geometry.points import ball_query, farthest_point_sample, gather_points
-from i2i.nn.batch_norm import JointBatchNorm1d, num_processes
+from i2i.nn.batch_norm import JointBatchNorm1d
+from i2i.nn.processes import num_processes
 
 
 class RowNorm(JointBatchNorm1d):

@@ -10,7 +10,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from i2i.data.info import DataInfo
-from i2i.nn.batch_norm import num_processes, sum_over_processes
+from i2i.nn.processes import num_processes, sum_over_processes
 
 Batch = dict[str, Tensor]
 
