@@ -43,6 +43,17 @@ def test_recall_is_the_share_under_each_error_in_one_colour_a_method():
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["a", "b", "random guess"]
 
 
+@pytest.mark.parametrize("count", [3, 10])
+@pytest.mark.parametrize("length", [5, 40])
+def test_the_legend_lies_inside_the_figure(count, length):
+    names = [f"{i}".ljust(length, "m") for i in range(count)]
+    figure = recall_figure({"x": {name: np.array([10.0]) for name in names}})
+    figure.canvas.draw()
+    inside = figure.legends[0].get_window_extent()
+    assert inside.x0 >= 0
+    assert inside.x1 <= figure.bbox.x1
+
+
 def test_no_panels_are_refused():
     with pytest.raises(ValueError, match="no panels"):
         recall_figure({})

@@ -106,11 +106,21 @@ def recall_figure(
         plain_axes(place)
     axes[0].set_ylabel("views under this error (%)", fontsize=8)
     shown = [handles[name] for name in [*order, "random guess"] if name in handles]
-    figure.legend(
-        handles=shown, loc="outside lower center", ncols=min(4, len(shown)), fontsize=8,
-        frameon=False,
-    )  # fmt: skip
+    _legend_below(figure, shown)
     return figure
+
+
+def _legend_below(figure: Figure, lines: Sequence[Line2D]) -> None:
+    """In as many columns as fit; the figure grows by its rows."""
+    for columns in range(min(4, len(lines)), 0, -1):
+        legend = figure.legend(
+            handles=lines, loc="outside lower center", ncols=columns, fontsize=8, frameon=False
+        )
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
+    rows = ceil(len(lines) / columns)
+    figure.set_figheight(figure.get_figheight() + 0.17 * (rows - 1))
 
 
 def _panels(count: int, *, height: float, heading: str) -> tuple[Figure, list[Axes]]:
