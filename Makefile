@@ -13,7 +13,7 @@ TORCH := $(shell grep '^torch==' requirements.lock)
 .PHONY: demo test lint bench table clean
 .DELETE_ON_ERROR:
 
-$(VENV)/.installed: requirements.lock pyproject.toml
+$(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py $(wildcard src/i2i/nn/native/*.[ch]*)
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if (3, 11) <= v[:2] <= (3, 12) else f"i2i wants Python 3.11 or 3.12, {sys.executable} is {v[0]}.{v[1]}. Try: make PYTHON=python3.11 ...")'
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) $(TORCH)

@@ -8,12 +8,25 @@ from torch import nn
 
 from i2i.configuration import compose
 from i2i.data.noise import noise_batch
+from i2i.nn import native
 from i2i.nn.c4 import C4BatchNorm, C4Conv, regular_type, trivial_type
 from i2i.nn.c4_dispatch import convolution_mode, set_convolution_mode, takes_spectral
 from i2i.nn.c4_resnet import STEM_MODES, C4ResNet18
 from i2i.nn.c4_stem import stem_map
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 from i2i.runs.building import build_network, info_of
+
+
+@pytest.fixture(params=["compiled", "torch"], autouse=True)
+def _form(request):
+    """Everything here holds for the compiled transforms and for torch's."""
+    if request.param == "compiled":
+        if native.library() is None:
+            pytest.skip("no compiler was found when i2i was installed")
+        yield
+    else:
+        with native.torch_only():
+            yield
 
 
 def relative_error(value, reference):
@@ -95,9 +108,10 @@ def networks(stem_mode, dtype, **options):
 
 def outcome(encoder, image, mode):
     """Map and gradients in training, running statistics after it, map in evaluation."""
-    encoder = copy.deepcopy(encoder).train()
+    encoder = copy.deepcopy(encoder).eval()
     with convolution_mode(mode):
-        assert encoder._is_spectral(image) == (mode == "spectral")
+        assert encoder._run_blocks(encoder._stem_map(image))[1] == (mode == "spectral")
+        encoder.train()
         out = encoder(image)
         (out * torch.linspace(-1, 1, out.numel(), dtype=out.dtype).view(out.shape)).sum().backward()
         encoder.eval()
@@ -202,7 +216,9 @@ def test_which_form_is_taken():
     with convolution_mode("auto"):
         assert takes_spectral(x, fields=76, map_size=8, training=True)
         assert not takes_spectral(x, fields=2, map_size=8, training=True)
-        assert not takes_spectral(x, fields=76, map_size=16, training=True)
+        compiled = native.has_compiled_transform(16)
+        assert takes_spectral(x, fields=76, map_size=16, training=True) == compiled
+        assert not takes_spectral(x, fields=76, map_size=15, training=True)
         assert not takes_spectral(x[:1], fields=76, map_size=8, training=False)
         with convolution_mode("dense"):
             assert not takes_spectral(x, fields=76, map_size=8, training=True)

@@ -1,12 +1,14 @@
 """The spectral C4 convolution against torch's dense convolution and escnn's kernels."""
 
 import warnings
+from collections.abc import Iterator
 
 import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from i2i.nn import native
 from i2i.nn.c4_spectral import (
     base_filters,
     spectral_conv2d,
@@ -19,6 +21,18 @@ from i2i.nn.c4_spectral_constants import is_supported
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
+
+
+@pytest.fixture(params=["compiled", "torch"], autouse=True)
+def _form(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Everything here holds for the compiled transforms and for torch's."""
+    if request.param == "compiled":
+        if native.library() is None:
+            pytest.skip("no compiler was found when i2i was installed")
+        yield
+    else:
+        with native.torch_only():
+            yield
 
 
 def expand(base: Tensor) -> Tensor:
@@ -36,7 +50,19 @@ def relative_error(value: Tensor, reference: Tensor) -> float:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize(
     ("map_size", "kernel_size", "batch"),
-    [(8, 3, 1), (8, 3, 5), (8, 1, 2), (8, 5, 2), (16, 3, 2), (9, 3, 2), (7, 5, 2), (3, 3, 1)],
+    [
+        (8, 3, 1),
+        (8, 3, 5),
+        (8, 1, 2),
+        (8, 5, 2),
+        (16, 3, 2),
+        (9, 3, 2),
+        (17, 3, 1),
+        (4, 3, 2),
+        (5, 3, 64),
+        (7, 5, 2),
+        (3, 3, 1),
+    ],
 )
 def test_equals_dense_for_arbitrary_c4_kernels(
     map_size: int, kernel_size: int, batch: int, dtype: torch.dtype

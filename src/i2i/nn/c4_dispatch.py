@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from i2i.nn.c4_spectral import is_supported
+from i2i.nn.native import has_compiled_transform
 
 MODES = ("auto", "dense", "spectral")
 _MODE = ["auto"]
@@ -21,7 +22,7 @@ _MODE = ["auto"]
 _LEAST_BATCH_TRAINING = 16
 _LEAST_BATCH_CACHED = 8
 _LEAST_FIELDS = 16
-_LARGEST_MAP = 9  # 16 × 16 maps gain little, and lose in bfloat16
+_LARGEST_MAP = 9  # 16 × 16 maps gain little, and lose in bfloat16, unless transforms are compiled
 
 
 def set_convolution_mode(mode: str) -> None:
@@ -75,7 +76,7 @@ def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> 
     least = _LEAST_BATCH_TRAINING if training else _LEAST_BATCH_CACHED
     return (
         x.device.type == "cpu"
-        and map_size <= _LARGEST_MAP
+        and (map_size <= _LARGEST_MAP or has_compiled_transform(map_size))
         and fields >= _LEAST_FIELDS
         and len(x) >= least
     )

@@ -203,10 +203,12 @@ class C4ResNet18(nn.Module):
             self.max_pool = nn.MaxPool2d(3, stride=2, padding=1)
 
         blocks: list[nn.Module] = []
+        # Blocks whose maps have one size: (first, end, fewest fields, map size).
+        self._stretches: list[tuple[int, int, int, int]] = []
         fields = width
         for layer, stride in enumerate(layer_strides):
+            first, out_fields = len(blocks), width * 2**layer
             for index in range(_BLOCKS_PER_LAYER):
-                out_fields = width * 2**layer
                 block = C4BasicBlock(
                     fields,
                     out_fields,
@@ -217,23 +219,23 @@ class C4ResNet18(nn.Module):
                 )
                 blocks.append(block)
                 fields = out_fields
+            if stride == 1 and self._stretches:
+                first, _, out_fields, _ = self._stretches.pop()
+            size = _map_size(image_size, stem_mode, tuple(layer_strides[: layer + 1]), max_pool)
+            self._stretches.append((first, len(blocks), out_fields, size))
         self.blocks = nn.Sequential(*blocks)
-        # From the last stride on all maps have the same size.
-        strided = [layer for layer, stride in enumerate(layer_strides) if stride > 1]
-        self.entry = _BLOCKS_PER_LAYER * max(strided, default=0)
-        self.entry_fields = width * 2 ** max(strided, default=0)
 
     def regular_map(self, image: Tensor) -> Tensor:
         """The map before the maximum over turns: (B, 4 · out_channels, S, S), regular fields."""
-        x = self._stem_map(image)
-        return from_pixel_major(self._pixel_major(x)) if self._is_spectral(x) else self.blocks(x)
+        x, is_pixel_major = self._run_blocks(self._stem_map(image))
+        return from_pixel_major(x) if is_pixel_major else x
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, C, H, W) in [0, 1] -> (B, out_channels, S, S)."""
-        x = self._stem_map(image)
-        if not self._is_spectral(x):
-            return group_max_pool(self.blocks(x))
-        x = self._pixel_major(x).amax(dim=1)  # (S · S, out_channels, B)
+        x, is_pixel_major = self._run_blocks(self._stem_map(image))
+        if not is_pixel_major:
+            return group_max_pool(x)
+        x = x.amax(dim=1)  # (S · S, out_channels, B)
         return x.permute(2, 1, 0).reshape(len(image), -1, self.map_size, self.map_size)
 
     def _stem_map(self, image: Tensor) -> Tensor:
@@ -247,24 +249,28 @@ class C4ResNet18(nn.Module):
         # The maximum commutes with ReLU: pooling first leaves a quarter of the elements to it.
         return torch.relu(self.max_pool(self.norm(self.stem(x))))
 
-    def _is_spectral(self, x: Tensor) -> bool:
-        """Whether the blocks from the last stride on work on pixel-major maps."""
-        return takes_spectral(
-            x,
-            fields=self.entry_fields,
-            map_size=self.map_size,
-            training=torch.is_grad_enabled(),
-        )
+    def _run_blocks(self, x: Tensor) -> tuple[Tensor, bool]:
+        """The blocks on (B, 4 · width, H, W), and whether what comes out is pixel-major.
 
-    def _pixel_major(self, x: Tensor) -> Tensor:
-        """The blocks: (B, 4 · width, H, W) -> (S · S, 4, out_channels, B)."""
-        for index, block in enumerate(self.blocks):
-            assert isinstance(block, C4BasicBlock)
-            if index < self.entry:
-                x = block(x)
-            else:
-                x = block.enter_pixel_major(x) if index == self.entry else block.pixel_major(x)
-        return x
+        The first block of a stretch changes the size of the map, which is done densely.
+        """
+        is_pixel_major = False
+        for first, end, fields, map_size in self._stretches:
+            if is_pixel_major:
+                x = from_pixel_major(x)
+            is_pixel_major = takes_spectral(
+                x, fields=fields, map_size=map_size, training=torch.is_grad_enabled()
+            )
+            for index in range(first, end):
+                block = self.blocks[index]
+                assert isinstance(block, C4BasicBlock)
+                if not is_pixel_major:
+                    x = block(x)
+                elif index == first:
+                    x = block.enter_pixel_major(x)
+                else:
+                    x = block.pixel_major(x)
+        return x, is_pixel_major
 
     def extra_repr(self) -> str:
         """`C4: 128×128 -> 304 × 8×8, stem ref`."""

@@ -49,14 +49,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
+from i2i.nn import native
 from i2i.nn.c4_spectral_constants import (
     MAX_MAP_SIZE,
     ORDER,
-    Constants,
     constants,
     is_supported,
     padded_size,
 )
+from i2i.nn.c4_transforms import Spectrum, analyse, synthesise
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 __all__ = [
@@ -69,11 +70,6 @@ __all__ = [
     "transform_filters",
     "transform_matrix",
 ]  # fmt: skip
-
-# Of fields x images: all non-zero orbits (n, 4 C, 4 B), columns (Re, Im at R w; Re, Im at w), and
-# w = 0 (4 C, B). What goes into the blocks has rows (sum|difference, slot, field), what comes out
-# (field, sum|difference, slot): so the blocks are written in order, see transform_filters.
-_Spectrum = tuple[Tensor, Tensor]
 
 
 def base_filters(kernel: Tensor) -> Tensor:
@@ -88,86 +84,19 @@ def base_filters(kernel: Tensor) -> Tensor:
     return kernel[::ORDER]
 
 
-def _turns(half: int, slot: int) -> tuple[tuple[int, int, float], tuple[int, int, float]]:
-    """(turn, g, sign): what a slot of the spectrum holds at R w and at w.
-
-    At R w the fields are numbered one further: slot 0 holds g = 1, and slot 1 holds g = 2, which
-    is g = 0 again, with the opposite sign for differences.
-    """
-    return (1, 1 - slot, -1.0 if half and slot else 1.0), (0, slot, 1.0)
-
-
-def _part(spectrum: _Spectrum, half: int, slot: int, *, fields_first: bool) -> _Spectrum:
-    """Views of one slot of a spectrum: (n, C, 4, B) and (C, B)."""
-    fields = spectrum[1].shape[0] // ORDER
-    batch = spectrum[1].shape[1]
-    if fields_first:
-        main = spectrum[0].view(-1, fields, 2, 2, ORDER, batch)[:, :, half, slot]
-        return main, spectrum[1].view(fields, 2, 2, batch)[:, half, slot]
-    main = spectrum[0].view(-1, 2, 2, fields, ORDER, batch)[:, half, slot]
-    return main, spectrum[1].view(2, 2, fields, batch)[half, slot]
-
-
-def _analyse(
-    x: Tensor, matrices: Constants, dtype: torch.dtype, *, fields_first: bool = False
-) -> _Spectrum:
-    """Apply S to maps (H^2, 4, C, B), in ``dtype``."""
-    pixels, _, fields, batch = x.shape
-    halves = x.view(pixels, 2, 2, fields * batch)
-    mixed = x.new_empty(pixels, 2, 2, fields * batch, dtype=dtype)
-    torch.add(halves[:, 0], halves[:, 1], out=mixed[:, 0])
-    torch.sub(halves[:, 0], halves[:, 1], out=mixed[:, 1])
-    orbits = matrices.orbits
-    spectrum = (
-        mixed.new_empty(orbits, ORDER * fields, ORDER * batch),
-        mixed.new_empty(ORDER * fields, batch),
-    )
-    rows = mixed.new_empty(ORDER * orbits + 1, fields * batch)
-    parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
-    for half in range(2):
-        for slot in range(2):
-            for turn, g, sign in _turns(half, slot):
-                torch.mm(sign * matrices.analysis[half][turn], mixed[:, half, g], out=parts[turn])
-            main, zero = _part(spectrum, half, slot, fields_first=fields_first)
-            main.copy_(rows[:-1].view(ORDER, orbits, fields, batch).permute(1, 2, 0, 3))
-            zero.copy_(rows[-1].view(fields, batch))
-    return spectrum
-
-
-def _synthesise(
-    spectrum: _Spectrum, matrices: Constants, like: Tensor, *, fields_first: bool = False
-) -> Tensor:
-    """Apply S^T: a spectrum to maps (H^2, 4, C, B) in the dtype and batch size of ``like``."""
-    pixels, batch = like.shape[0], like.shape[3]
-    orbits, fields = matrices.orbits, spectrum[1].shape[0] // ORDER
-    mixed = spectrum[0].new_empty(pixels, 2, 2, fields * batch)
-    rows = mixed.new_empty(ORDER * orbits + 1, fields * batch)
-    parts = {1: rows[: 2 * orbits], 0: rows[2 * orbits :]}
-    for half in range(2):
-        for slot in range(2):
-            main, zero = _part(spectrum, half, slot, fields_first=fields_first)
-            rows[:-1].view(ORDER, orbits, fields, batch).copy_(main.permute(2, 0, 1, 3))
-            rows[-1].view(fields, batch).copy_(zero)
-            for turn, g, sign in _turns(half, slot):
-                matrix, sums = matrices.analysis[half][turn].mT, mixed[:, half, g]
-                # The first slot writes both parities, the second adds to both.
-                if slot == 0:
-                    torch.mm(sign * matrix, parts[turn], out=sums)
-                else:
-                    sums.addmm_(matrix, parts[turn], alpha=sign)
-    y = like.new_empty(pixels, 2, 2, fields * batch)
-    torch.add(mixed[:, 0], mixed[:, 1], out=y[:, 0])
-    torch.sub(mixed[:, 0], mixed[:, 1], out=y[:, 1])
-    return y.view(pixels, ORDER, fields, batch)
-
-
-def _multiply(blocks: Tensor, spectrum: _Spectrum) -> _Spectrum:
+def _multiply(blocks: Tensor, spectrum: Spectrum) -> Spectrum:
     """Multiply the blocks (n + 1, M, K) with a spectrum."""
     return torch.bmm(blocks[:-1], spectrum[0]), torch.mm(blocks[-1], spectrum[1])
 
 
-def _coefficient_gradient(upstream: _Spectrum, spectrum: _Spectrum, matrix: Tensor) -> Tensor:
-    """dL/d(coefficients), (C_out, C_in, K), one orbit after the other: dA is never whole."""
+def _coefficient_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor) -> Tensor:
+    """dL/d(coefficients), (C_out, C_in, K)."""
+    if native.is_built_for(matrix, upstream[0].dtype):
+        gradient = upstream[1].new_empty(len(upstream[0]) + 1, len(upstream[1]), len(spectrum[1]))
+        torch.bmm(upstream[0], spectrum[0].mT, out=gradient[:-1])
+        torch.mm(upstream[1], spectrum[1].mT, out=gradient[-1])
+        return native.coefficient_gradient(gradient, matrix)
+    # One orbit after the other: dA is never whole.
     out_size, in_size = len(upstream[1]), len(spectrum[1])
     out_fields, in_fields = out_size // ORDER, in_size // ORDER
     total = matrix.new_zeros(out_fields, matrix.shape[1], in_fields)
@@ -205,28 +134,22 @@ class _SpectralConv(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         main, zero, blocks, matrix = ctx.saved_tensors  # type: ignore[attr-defined]
         grad = grad.contiguous()
-        matrices = constants(
-            math.isqrt(len(grad)),
-            ctx.kernel_size,  # type: ignore[attr-defined]
-            blocks.dtype,
-            grad.device,
-        )
-        upstream = _analyse(grad, matrices, blocks.dtype, fields_first=True)
+        kernel_size = ctx.kernel_size  # type: ignore[attr-defined]
+        upstream = analyse(grad, blocks.dtype, kernel_size=kernel_size, fields_first=True)
         need_x, need_coefficients = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad_x = grad_coefficients = None
         if need_coefficients:
             grad_coefficients = _coefficient_gradient(upstream, (main, zero), matrix)
         if need_x:
-            grad_x = _synthesise(_multiply(blocks.mT, upstream), matrices, grad)
+            grad_x = synthesise(_multiply(blocks.mT, upstream), grad, kernel_size=kernel_size)
         return grad_x, grad_coefficients, None, None, None
 
 
-def _apply(x: Tensor, blocks: Tensor, kernel_size: int) -> tuple[Tensor, _Spectrum]:
+def _apply(x: Tensor, blocks: Tensor, kernel_size: int) -> tuple[Tensor, Spectrum]:
     """S^T A S x and the spectrum S x."""
-    matrices = constants(math.isqrt(len(x)), kernel_size, blocks.dtype, x.device)
-    spectrum = _analyse(x, matrices, blocks.dtype)
+    spectrum = analyse(x, blocks.dtype, kernel_size=kernel_size)
     product = _multiply(blocks, spectrum)
-    return _synthesise(product, matrices, x, fields_first=True), spectrum
+    return synthesise(product, x, kernel_size=kernel_size, fields_first=True), spectrum
 
 
 def transform_matrix(
@@ -266,6 +189,8 @@ def transform_filters(
         Blocks, shape ((N^2 - 1) / 4 + 1, 4 * C_out, 4 * C_in), w = 0 last; rows (field, s'|e', h),
         columns (s|e, g, field).
     """
+    if native.is_built_for(coefficients, dtype or coefficients.dtype):
+        return native.blocks(coefficients, matrix, dtype or coefficients.dtype)
     (out_fields, in_fields), parts = coefficients.shape[:2], matrix.split(ORDER**2)
     columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
     blocks = columns.new_empty(

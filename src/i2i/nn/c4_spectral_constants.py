@@ -63,7 +63,7 @@ def constants(
 ) -> Constants:
     """Build the constant matrices in float64 and cast them."""
     size = padded_size(map_size, kernel_size)
-    orbits = _orbits(size)
+    orbits = orbit_representatives(size)
     omega = torch.tensor([*orbits, (0, 0)], dtype=torch.float64) * (2.0 * math.pi / size)
     analysis = tuple(
         tuple(part.to(device, dtype) for part in half)
@@ -73,14 +73,15 @@ def constants(
     return Constants(len(orbits), analysis, filters)  # type: ignore[arg-type]
 
 
-def _orbits(size: int) -> list[tuple[int, int]]:
-    """One frequency of each {w, Rw, -w, -Rw}, w non-zero on the N x N torus."""
+def orbit_representatives(size: int) -> list[tuple[int, int]]:
+    """One frequency of each {w, Rw, -w, -Rw}, w non-zero on the N x N torus, from -N/2 to N/2."""
     found: list[tuple[int, int]] = []
     seen = {(0, 0)}
+    middle = size // 2
     for a in range(size):
         for b in range(size):
             if (a, b) not in seen:
-                found.append((a, b))
+                found.append((a - size if a > middle else a, b - size if b > middle else b))
                 for _ in range(ORDER):
                     seen.add((a, b))
                     a, b = -b % size, a
@@ -94,7 +95,8 @@ def _turn(vectors: Tensor) -> Tensor:
 
 def _analysis(omega: Tensor, map_size: int, scale: float) -> list[list[Tensor]]:
     """``Constants.analysis`` in float64; the last row of ``omega`` is zero."""
-    cells = torch.arange(map_size, dtype=torch.float64)
+    # Counted from the middle of the map: any origin does, and this one halves `native`'s work.
+    cells = torch.arange(map_size, dtype=torch.float64) - (map_size - 1) / 2
     cells = torch.cartesian_prod(cells, cells)
     halves: list[list[Tensor]] = [[], []]
     for turn, frequencies in enumerate((omega, _turn(omega[:-1]))):

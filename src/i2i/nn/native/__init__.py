@@ -1,0 +1,208 @@
+"""The transforms of the C4-spectral convolution as compiled code, where a compiler was found.
+
+`hatch_build.py` builds the sources beside this file when i2i is installed, once for each set of
+instructions. Without a library for this processor, on other map sizes and on other devices
+:func:`is_built_for` and :func:`has_compiled_transform` say so, and `c4_spectral` computes the same
+with torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from i2i.nn.c4_spectral_constants import ORDER, orbit_representatives, padded_size
+
+_TYPES = {
+    (torch.float32, torch.float32): 0,
+    (torch.float32, torch.bfloat16): 1,
+    (torch.float64, torch.float64): 2,
+}  # of maps and spectrum, of coefficients and blocks
+_MAP_SIZES = {(4, 5), (5, 7), (8, 9), (9, 11), (16, 17), (17, 19)}  # H and N that are built
+_ENABLED = [True]
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The library for this processor, or None."""
+    capability = torch.backends.cpu.get_cpu_capability().lower()
+    path = Path(__file__).with_name(f"c4_spectral_{capability}.so")
+    if not path.exists():
+        return None
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:
+        return None
+
+
+def _library() -> ctypes.CDLL:
+    found = library()
+    assert found is not None, "no library for this processor: ask is_built_for first"
+    return found
+
+
+@contextmanager
+def torch_only() -> Iterator[None]:
+    """Leave the library aside for a while, for comparisons.
+
+    Example:
+        >>> with torch_only():
+        ...     pass
+    """
+    before = _ENABLED[0]
+    _ENABLED[0] = False
+    try:
+        yield
+    finally:
+        _ENABLED[0] = before
+
+
+def is_built_for(tensor: Tensor, dtype: torch.dtype) -> bool:
+    """Whether the library takes maps or coefficients to spectra or blocks of `dtype`."""
+    return (
+        _ENABLED[0]
+        and tensor.device.type == "cpu"
+        and (tensor.dtype, dtype) in _TYPES
+        and library() is not None
+    )
+
+
+def has_compiled_transform(map_size: int, kernel_size: int = 3) -> bool:
+    """Whether maps of this size are transformed by the library."""
+    size = padded_size(map_size, kernel_size)
+    return _ENABLED[0] and (map_size, size) in _MAP_SIZES and library() is not None
+
+
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(mode=False)
+def _tables(map_size: int, size: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Frequencies (n, 2, 4), int32: |a|, |b| and their signs at w and R w; waves (2, M + 1, h)."""
+    middle = size // 2
+    frequencies = []
+    for a, b in orbit_representatives(size):
+        for w in ((a, b), (-b, a)):
+            frequencies.append([abs(part) for part in w] + [1 if part >= 0 else -1 for part in w])
+    half = (map_size + 1) // 2
+    distance = torch.arange(half, dtype=torch.float64) + (0.5 if map_size % 2 == 0 else 0.0)
+    angle = torch.arange(middle + 1, dtype=torch.float64)[:, None] * distance * (2 * math.pi / size)
+    waves = torch.stack([angle.cos(), angle.sin()]) / math.sqrt(size)
+    table = torch.tensor(frequencies, dtype=torch.int32).view(-1, 2, 4)
+    return table.contiguous(), waves.to(dtype).contiguous()
+
+
+def analyse(
+    maps: Tensor, dtype: torch.dtype, *, kernel_size: int, fields_first: bool
+) -> tuple[Tensor, Tensor]:
+    """Transform pixel-major maps (H * H, 4, C, B); only where they are built.
+
+    Returns:
+        The spectrum as in `c4_spectral`: (n, 4 C, 4 B) and (4 C, B), in ``dtype``.
+    """
+    maps = maps.contiguous()
+    pixels, _, fields, batch = maps.shape
+    orbits = (padded_size(math.isqrt(pixels), kernel_size) ** 2 - 1) // ORDER
+    main = maps.new_empty(orbits, ORDER * fields, ORDER * batch, dtype=dtype)
+    zero = maps.new_empty(ORDER * fields, batch, dtype=dtype)
+    _call("i2i_analyse", (maps, main, zero), maps, dtype, kernel_size, fields_first)
+    return main, zero
+
+
+def synthesise(
+    main: Tensor, zero: Tensor, maps: Tensor, *, kernel_size: int, fields_first: bool
+) -> Tensor:
+    """Transform a spectrum back, into ``maps`` (H * H, 4, C, B), contiguous."""
+    arrays = (main.contiguous(), zero.contiguous(), maps)
+    _call("i2i_synthesise", arrays, maps, main.dtype, kernel_size, fields_first)
+    return maps
+
+
+def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
+    """(B, 4 C, P) to (P, 4, C, B), or back; float32 or float64 where :func:`is_built_for`."""
+    maps = maps.contiguous()
+    rows, columns = maps.shape[0], maps.shape[-1]
+    fields = maps[0].numel() // (ORDER * columns)
+    shape = (columns, ORDER, fields, rows) if to_pixel_major else (columns, fields * ORDER, rows)
+    result = maps.new_empty(shape)
+    _library().i2i_turn_over(
+        ctypes.c_void_p(maps.data_ptr()),
+        ctypes.c_void_p(result.data_ptr()),
+        int(to_pixel_major),
+        int(maps.dtype == torch.float64),
+        ctypes.c_int64(rows),
+        ctypes.c_int64(fields),
+        ctypes.c_int64(columns),
+        torch.get_num_threads(),
+    )
+    return result
+
+
+def blocks(coefficients: Tensor, matrix: Tensor, dtype: torch.dtype) -> Tensor:
+    """Make the blocks, see `c4_spectral.transform_filters`; only where :func:`is_built_for`."""
+    out_fields, in_fields, _ = coefficients.shape
+    orbits = len(matrix) // ORDER**2
+    result = coefficients.new_empty(orbits, ORDER * out_fields, ORDER * in_fields, dtype=dtype)
+    columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
+    _filters_call("i2i_blocks", columns, matrix, result)
+    return result
+
+
+def coefficient_gradient(upstream: Tensor, matrix: Tensor) -> Tensor:
+    """dL/d(coefficients), (C_out, C_in, K), from that of the blocks (n + 1, 4 C_out, 4 C_in)."""
+    _, rows, columns = upstream.shape
+    gradient = matrix.new_zeros(rows // ORDER, matrix.shape[1], columns // ORDER)
+    _filters_call("i2i_coefficient_gradient", gradient, matrix, upstream.contiguous())
+    return gradient.mT.contiguous()
+
+
+def _filters_call(name: str, coefficients: Tensor, matrix: Tensor, blocks: Tensor) -> None:
+    """Both directions between coefficients (C_out, K, C_in) and blocks."""
+    out_fields, count, in_fields = coefficients.shape
+    entries = matrix.view(-1, ORDER**2, matrix.shape[1]).mT.contiguous()  # (n + 1, K, 16)
+    left, right = (blocks, coefficients) if "gradient" in name else (coefficients, blocks)
+    getattr(_library(), name)(
+        ctypes.c_void_p(left.data_ptr()),
+        ctypes.c_void_p(entries.data_ptr()),
+        ctypes.c_void_p(right.data_ptr()),
+        _TYPES[coefficients.dtype, blocks.dtype],
+        ctypes.c_int64(len(entries)),
+        ctypes.c_int64(out_fields),
+        ctypes.c_int64(in_fields),
+        ctypes.c_int64(count),
+        torch.get_num_threads(),
+    )
+
+
+def _call(
+    name: str,
+    arrays: tuple[Tensor, Tensor, Tensor],
+    maps: Tensor,
+    dtype: torch.dtype,
+    kernel_size: int,
+    fields_first: bool,
+) -> None:
+    pixels, _, fields, batch = maps.shape
+    map_size = math.isqrt(pixels)
+    size = padded_size(map_size, kernel_size)
+    frequencies, waves = _tables(map_size, size, maps.dtype)
+    pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
+    status = getattr(_library(), name)(
+        *pointers,
+        map_size,
+        size,
+        _TYPES[maps.dtype, dtype],
+        ctypes.c_int64(len(frequencies)),
+        ctypes.c_int64(fields),
+        ctypes.c_int64(batch),
+        int(fields_first),
+        ctypes.c_void_p(frequencies.data_ptr()),
+        ctypes.c_void_p(waves.data_ptr()),
+        torch.get_num_threads(),
+    )
+    assert status == 0, f"{name} is not built for {map_size} x {map_size} maps"

@@ -1,0 +1,170 @@
+"""The compiled transforms against their torch form, and what is built where."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from i2i.nn import native
+from i2i.nn.c4_spectral import (
+    _coefficient_gradient,
+    spectral_conv2d_base,
+    transform_filters,
+)
+from i2i.nn.c4_transforms import analyse, synthesise
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
+
+needs_library = pytest.mark.skipif(
+    native.library() is None, reason="no compiler was found when i2i was installed"
+)
+SIZES = (4, 5, 8, 9, 16, 17)  # of maps: what is compiled for 3 x 3 kernels
+TYPES = [
+    (torch.float32, torch.float32, 1e-6),
+    (torch.float64, torch.float64, 1e-14),
+    (torch.float32, torch.bfloat16, 1e-2),
+]
+
+
+def relative_error(value, reference):
+    value, reference = value.double(), reference.double()
+    return ((value - reference).norm() / reference.norm()).item()
+
+
+def in_torch(function, *args, **options):
+    with native.torch_only():
+        return function(*args, **options)
+
+
+@needs_library
+@pytest.mark.parametrize(("dtype", "spectral", "tolerance"), TYPES)
+@pytest.mark.parametrize("batch", [1, 16, 21, 64, 70])
+@pytest.mark.parametrize("map_size", SIZES)
+def test_spectra_and_maps_are_those_of_torch(map_size, batch, dtype, spectral, tolerance):
+    """Whole and broken vectors of images, both orders of the rows."""
+    assert native.has_compiled_transform(map_size)
+    x = torch.randn(map_size**2, 4, 3, batch, dtype=dtype)
+    for fields_first in (False, True):
+        options = {"kernel_size": 3, "fields_first": fields_first}
+        ours = analyse(x, spectral, **options)
+        theirs = in_torch(analyse, x, spectral, **options)
+        for part, reference in zip(ours, theirs, strict=True):
+            assert part.dtype == spectral
+            assert relative_error(part, reference) < tolerance
+        noise = tuple(torch.randn_like(part) for part in ours)
+        assert relative_error(
+            synthesise(noise, x, **options), in_torch(synthesise, noise, x, **options)
+        ) < tolerance  # fmt: skip
+
+
+@needs_library
+@pytest.mark.parametrize("fields", [16, 5])
+def test_nothing_behind_the_maps_is_written(fields):
+    shape = (64, 4, fields, 21)
+    guarded = torch.full((torch.Size(shape).numel() + 64,), 7.0)
+    maps = guarded[:-64].view(shape)
+    spectrum = analyse(torch.randn(shape), torch.float32, kernel_size=3)
+    native.synthesise(*spectrum, maps, kernel_size=3, fields_first=False)
+    assert (guarded[-64:] == 7.0).all()
+    assert (maps != 7.0).all()
+
+
+@needs_library
+def test_bfloat16_spectra_are_rounded_once():
+    """To nearest, ties to even, as torch rounds; what is not a number stays so."""
+    x = torch.randn(64, 4, 2, 37)
+    x[3, 1, 0, 5], x[4, 2, 1, 20] = float("nan"), float("inf")
+    exact = analyse(x, torch.float32, kernel_size=3)
+    rounded = analyse(x, torch.bfloat16, kernel_size=3)
+    for part, reference in zip(rounded, exact, strict=True):
+        assert torch.equal(part.isnan(), reference.isnan())
+        assert torch.equal(part.nan_to_num(), reference.bfloat16().nan_to_num())
+    assert rounded[0].isnan().any()
+
+
+@needs_library
+@pytest.mark.parametrize(("dtype", "spectral", "tolerance"), TYPES)
+@pytest.mark.parametrize(("outs", "ins", "count"), [(5, 3, 24), (3, 38, 36), (2, 48, 9)])
+def test_blocks_and_their_gradient_are_those_of_torch(outs, ins, count, dtype, spectral, tolerance):
+    coefficients = torch.randn(outs, ins, count, dtype=dtype)
+    matrix = torch.randn(21 * 16, count, dtype=dtype)
+    blocks = transform_filters(coefficients, matrix, dtype=spectral)
+    expected = in_torch(transform_filters, coefficients, matrix, dtype=spectral)
+    assert blocks.shape == expected.shape
+    assert relative_error(blocks, expected) < tolerance
+
+    def columns(fields):
+        parts = (
+            torch.randn(20, 4 * fields, 16, dtype=dtype),
+            torch.randn(4 * fields, 4, dtype=dtype),
+        )
+        return tuple(part.to(spectral) for part in parts)
+
+    upstream, spectrum = columns(outs), columns(ins)
+    gradient = _coefficient_gradient(upstream, spectrum, matrix)
+    expected = in_torch(_coefficient_gradient, upstream, spectrum, matrix)
+    assert gradient.shape == expected.shape
+    assert relative_error(gradient, expected) < tolerance
+
+
+@needs_library
+@pytest.mark.parametrize("shape", [(3, 8, 5, 5), (64, 12, 8, 8), (21, 4, 17, 17)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_layouts_are_those_of_torch(shape, dtype):
+    x = torch.randn(shape, dtype=dtype)
+    pixel_major = to_pixel_major(x)
+    assert torch.equal(pixel_major, in_torch(to_pixel_major, x))
+    assert torch.equal(from_pixel_major(pixel_major), x)
+    strided = torch.randn(shape[::-1], dtype=dtype).permute(3, 2, 1, 0)
+    assert torch.equal(to_pixel_major(strided), in_torch(to_pixel_major, strided))
+
+
+def test_the_gradient_of_a_layout_is_the_layout_back():
+    x = torch.randn(2, 8, 3, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(to_pixel_major, x)
+    assert torch.autograd.gradgradcheck(to_pixel_major, x)
+
+
+@needs_library
+def test_threads_do_not_change_the_result():
+    maps = to_pixel_major(torch.randn(20, 12, 8, 8))
+    one = analyse(maps, torch.float32, kernel_size=3)
+    torch.set_num_threads(2)
+    two = analyse(maps, torch.float32, kernel_size=3)
+    assert all(map(torch.equal, one, two))
+
+
+@needs_library
+def test_both_instruction_sets_compute_the_same(tmp_path):
+    """The library for processors without AVX-512, on any that has AVX2."""
+    if torch.backends.cpu.get_cpu_capability() not in ("AVX512", "AVX2"):
+        pytest.skip("one library only on this kind of processor")
+    script = (
+        "import sys, torch; from i2i.nn import native; "
+        "from i2i.nn.c4_spectral import spectral_conv2d_base as conv; torch.manual_seed(0); "
+        "x, base = torch.randn(20, 12, 8, 8), torch.randn(5, 12, 3, 3); "
+        "print(native.library()._name); torch.save(conv(x, base), sys.argv[1])"
+    )
+    path = tmp_path / "avx2.pt"
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        env={**os.environ, "ATEN_CPU_CAPABILITY": "avx2"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "c4_spectral_avx2" in done.stdout
+    torch.manual_seed(0)
+    x, base = torch.randn(20, 12, 8, 8), torch.randn(5, 12, 3, 3)
+    with native.torch_only():
+        expected = spectral_conv2d_base(x, base)
+    assert relative_error(torch.load(path), expected) < 1e-6
+
+
+def test_torch_only_leaves_the_library_aside():
+    x = torch.randn(64, 4, 2, 3)
+    with native.torch_only():
+        assert not native.is_built_for(x, torch.float32)
+        assert not native.has_compiled_transform(8)
+    assert native.is_built_for(x, torch.float32) == (native.library() is not None)
+    assert not native.is_built_for(x.half(), torch.float16)
+    assert not native.has_compiled_transform(7)
