@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import icosahedron
 from i2i.models.i2i import I2IPose, I2ITrunk
-from i2i.nn.c4 import C4BatchNorm, C4Conv, regular_type
+from i2i.nn.c4 import C4Conv, regular_type
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_resnet import C4BasicBlock, C4ResNet18
 from i2i.nn.group_convs import DynamicFilterConv
 from i2i.nn.projectors import IcosahedralProjector

@@ -9,7 +9,8 @@ from torch import nn
 from i2i.configuration import compose, config_dir, modalities
 from i2i.data.info import CLOUDS
 from i2i.data.noise import noise_batch
-from i2i.nn.c4 import C4BatchNorm, C4Conv
+from i2i.nn.c4 import C4Conv
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.folding import fold
 from i2i.runs.building import build_network, info_of
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, distributed, nn
 
-from i2i.nn.c4 import C4BatchNorm
 from i2i.nn.c4_dispatch import convolution_mode
+from i2i.nn.c4_norm import C4BatchNorm
 
 PROCESSES = 2
 

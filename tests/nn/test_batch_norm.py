@@ -15,8 +15,8 @@ from torch import nn
 from i2i.configuration import compose
 from i2i.data.noise import noise_batch
 from i2i.nn.batch_norm import JointBatchNorm1d, JointBatchNorm2d, update_running
-from i2i.nn.c4 import C4BatchNorm
 from i2i.nn.c4_dispatch import convolution_mode
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.point_sets import RowNorm
 from i2i.runs.building import build_network, info_of
 

@@ -9,8 +9,9 @@ from torch import nn
 from i2i.configuration import compose
 from i2i.data.noise import noise_batch
 from i2i.nn import native
-from i2i.nn.c4 import C4BatchNorm, C4Conv, regular_type, trivial_type
+from i2i.nn.c4 import C4Conv, regular_type, trivial_type
 from i2i.nn.c4_dispatch import convolution_mode, set_convolution_mode, takes_spectral
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_resnet import STEM_MODES, C4ResNet18
 from i2i.nn.c4_stem import stem_map
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major

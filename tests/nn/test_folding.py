@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from i2i.nn.c4 import C4BatchNorm, C4Conv, regular_type, trivial_type
+from i2i.nn.c4 import C4Conv, regular_type, trivial_type
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_resnet import STEM_MODES, C4ResNet18
 from i2i.nn.folding import PlainC4ResNet, fold
 from i2i.nn.resnet import ResNet18

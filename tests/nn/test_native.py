@@ -1,5 +1,6 @@
 """The compiled transforms against their torch form, and what is built where."""
 
+import copy
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from i2i.nn import native
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_spectral import (
     _coefficient_gradient,
     spectral_conv2d_base,
@@ -118,6 +120,51 @@ def test_layouts_are_those_of_torch(shape, dtype):
     assert torch.equal(from_pixel_major(pixel_major), x)
     strided = torch.randn(shape[::-1], dtype=dtype).permute(3, 2, 1, 0)
     assert torch.equal(to_pixel_major(strided), in_torch(to_pixel_major, strided))
+
+
+@needs_library
+@pytest.mark.parametrize("batch", [1, 16, 37])
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("with_shortcut", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_norm_is_that_of_torch(dtype, with_shortcut, relu, batch):
+    """Values, gradients and running statistics of a step; then evaluation."""
+    leaves = [3 + 2 * torch.randn(16, 4, 5, batch, dtype=dtype) for _ in range(2)]
+    upstream = torch.randn_like(leaves[0])
+    norm = C4BatchNorm(5).to(dtype)
+    torch.nn.init.normal_(norm.weight)
+    torch.nn.init.normal_(norm.bias)
+
+    def outcome(norm):
+        x, shortcut = (leaf.clone().requires_grad_() for leaf in leaves)
+        options = {"shortcut": shortcut if with_shortcut else None, "relu": relu}
+        assert norm._is_compiled(x) == native.is_built_for(x, x.dtype)
+        y = norm.pixel_major(x, **options)
+        y.backward(upstream)
+        gradients = [t.grad for t in (x, shortcut, norm.weight, norm.bias) if t.grad is not None]
+        norm.eval()
+        with torch.no_grad():
+            evaluated = norm.pixel_major(leaves[1], **options)
+        frozen = norm.pixel_major(x, **options)  # a gradient through constant moments: torch's
+        (of_x,) = torch.autograd.grad(frozen, x, upstream)
+        return [y, *gradients, evaluated, of_x, norm.running_mean, norm.running_var]
+
+    ours, expected = outcome(copy.deepcopy(norm)), in_torch(outcome, copy.deepcopy(norm))
+    assert len(ours) == len(expected)
+    tolerance = 2e-6 if dtype == torch.float32 else 1e-13
+    for value, reference in zip(ours, expected, strict=True):
+        assert relative_error(value, reference) < tolerance
+
+
+@needs_library
+def test_the_norm_keeps_the_digits_of_a_small_spread_about_a_large_mean():
+    exact = 1000 + torch.randn(64, 4, 3, 16, dtype=torch.float64)
+    moments = torch.empty(2, 3, dtype=torch.float64)
+    x = exact.float()
+    native.norm(x, None, torch.ones(3), torch.zeros(3), moments, eps=1e-5, relu=False, fresh=True)
+    rows = x.double().permute(2, 0, 1, 3).flatten(1)
+    assert relative_error(moments[0], rows.mean(dim=1)) < 1e-9
+    assert relative_error(moments[1], rows.var(dim=1, correction=0)) < 1e-5
 
 
 def test_the_gradient_of_a_layout_is_the_layout_back():

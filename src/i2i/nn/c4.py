@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from i2i.nn.batch_norm import JointBatchNorm2d
 from i2i.nn.c4_basis import TURNS, full_basis, symmetrise
 from i2i.nn.c4_dispatch import is_traced
 from i2i.nn.c4_spectral import (
@@ -352,38 +351,6 @@ def _same(snapshot: Tensor, weights: Tensor) -> bool:
         and snapshot.device == weights.device
         and torch.equal(snapshot, weights)
     )
-
-
-class C4BatchNorm(JointBatchNorm2d):
-    """Batch norm with one affine pair per regular field, statistics pooled over the four turns.
-
-    Where processes share a batch, the statistics are those of all of it.
-
-    Shape:
-        (B, 4 · num_fields, H, W) -> the same.
-
-    Example:
-        >>> C4BatchNorm(3)(torch.randn(2, 12, 5, 5)).shape
-        torch.Size([2, 12, 5, 5])
-    """
-
-    def forward(self, input: Tensor) -> Tensor:
-        """Normalise `input` (B, 4 · num_fields, H, W)."""
-        batch, channels, height, width = input.shape
-        # One row per field: (B, F, 4·H, W), a view of a contiguous tensor. torch's channels-last
-        # batch norm is much less accurate in float32: rows are made contiguous where they are not.
-        rows = input.reshape(batch, channels // TURNS, TURNS * height, width)
-        return super().forward(rows).view(batch, channels, height, width)
-
-    def pixel_major(
-        self, x: Tensor, *, shortcut: Tensor | None = None, relu: bool = False
-    ) -> Tensor:
-        """The same on pixel-major maps (pixels, 4, num_fields, B), then add and clip in place."""
-        out = super().forward(x.view(-1, *x.shape[2:], 1))
-        if shortcut is not None:
-            out = out.add_(shortcut.view(out.shape))
-        # Before the view: autograd would copy around an operation in place on one.
-        return (torch.relu_(out) if relu else out).view(x.shape)
 
 
 def group_max_pool(x: Tensor) -> Tensor:

@@ -5,8 +5,9 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from i2i.nn.c4 import C4BatchNorm, C4Conv, group_max_pool, regular_type, trivial_type
+from i2i.nn.c4 import C4Conv, group_max_pool, regular_type, trivial_type
 from i2i.nn.c4_dispatch import takes_product, takes_spectral
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_stem import stem_map
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 from i2i.nn.precision import at_least_float32

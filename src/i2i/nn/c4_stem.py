@@ -18,7 +18,8 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 from torch.nn import functional
 
 from i2i.nn.batch_norm import update_running
-from i2i.nn.c4 import TURNS, C4BatchNorm, C4Conv
+from i2i.nn.c4 import TURNS, C4Conv
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.precision import full_precision
 from i2i.nn.processes import sum_over_processes
 

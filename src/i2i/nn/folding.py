@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from i2i.nn.batch_norm import JointBatchNorm2d
-from i2i.nn.c4 import TURNS, C4BatchNorm, C4Conv, group_max_pool
+from i2i.nn.c4 import TURNS, C4Conv, group_max_pool
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_resnet import C4BasicBlock, C4ResNet18
 from i2i.nn.log_polar import CircularRowsConv2d
 from i2i.nn.resnet import BasicBlock, ResNet18

@@ -131,8 +131,8 @@ def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
     shape = (columns, ORDER, fields, rows) if to_pixel_major else (columns, fields * ORDER, rows)
     result = maps.new_empty(shape)
     _library().i2i_turn_over(
-        ctypes.c_void_p(maps.data_ptr()),
-        ctypes.c_void_p(result.data_ptr()),
+        _pointer(maps),
+        _pointer(result),
         int(to_pixel_major),
         int(maps.dtype == torch.float64),
         ctypes.c_int64(rows),
@@ -167,9 +167,9 @@ def _filters_call(name: str, coefficients: Tensor, matrix: Tensor, blocks: Tenso
     entries = matrix.view(-1, ORDER**2, matrix.shape[1]).mT.contiguous()  # (n + 1, K, 16)
     left, right = (blocks, coefficients) if "gradient" in name else (coefficients, blocks)
     getattr(_library(), name)(
-        ctypes.c_void_p(left.data_ptr()),
-        ctypes.c_void_p(entries.data_ptr()),
-        ctypes.c_void_p(right.data_ptr()),
+        _pointer(left),
+        _pointer(entries),
+        _pointer(right),
         _TYPES[coefficients.dtype, blocks.dtype],
         ctypes.c_int64(len(entries)),
         ctypes.c_int64(out_fields),
@@ -191,9 +191,8 @@ def _call(
     map_size = math.isqrt(pixels)
     size = padded_size(map_size, kernel_size)
     frequencies, waves = _tables(map_size, size, maps.dtype)
-    pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
     status = getattr(_library(), name)(
-        *pointers,
+        *map(_pointer, arrays),
         map_size,
         size,
         _TYPES[maps.dtype, dtype],
@@ -201,8 +200,82 @@ def _call(
         ctypes.c_int64(fields),
         ctypes.c_int64(batch),
         int(fields_first),
-        ctypes.c_void_p(frequencies.data_ptr()),
-        ctypes.c_void_p(waves.data_ptr()),
+        _pointer(frequencies),
+        _pointer(waves),
         torch.get_num_threads(),
     )
     assert status == 0, f"{name} is not built for {map_size} x {map_size} maps"
+
+
+def norm(
+    x: Tensor,
+    shortcut: Tensor | None,
+    weight: Tensor,
+    bias: Tensor,
+    moments: Tensor,
+    *,
+    eps: float,
+    relu: bool,
+    fresh: bool,
+) -> Tensor:
+    """Normalise pixel-major maps (..., F, B), add ``shortcut`` and clip.
+
+    Args:
+        x: Maps whose types :func:`is_built_for` takes.
+        shortcut: Maps of the same shape, or None.
+        weight: (F,), like ``bias`` in the dtype of ``x``.
+        bias: (F,).
+        moments: Mean and biased variance, (2, F), float64.
+        eps: Added to the variance.
+        relu: Whether to clip.
+        fresh: Take the moments of ``x``, and write them to ``moments``.
+    """
+    x, weight, bias = x.contiguous(), weight.contiguous(), bias.contiguous()
+    shortcut = None if shortcut is None else shortcut.contiguous()
+    y = torch.empty_like(x)
+    _library().i2i_norm(
+        *map(_pointer, (x, shortcut, weight, bias, *moments, y)),
+        ctypes.c_double(eps),
+        int(relu),
+        int(fresh),
+        *_rows(x),
+    )
+    return y
+
+
+def norm_backward(
+    grad: Tensor,
+    clipped: Tensor | None,
+    x: Tensor,
+    weight: Tensor,
+    moments: Tensor,
+    *,
+    eps: float,
+    has_shortcut: bool,
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Gradients of :func:`norm` with fresh moments: of x, shortcut, weight and bias (float64).
+
+    ``clipped`` is what :func:`norm` gave, where it clipped.
+    """
+    grad, weight = grad.contiguous(), weight.contiguous()
+    of_x = torch.empty_like(x)
+    of_shortcut = torch.empty_like(x) if has_shortcut else None
+    of_affine = torch.empty_like(moments)
+    _library().i2i_norm_backward(
+        *map(_pointer, (grad, clipped, x, weight, *moments)),
+        *map(_pointer, (of_x, of_shortcut, *of_affine)),
+        ctypes.c_double(eps),
+        *_rows(x),
+    )
+    return of_x, of_shortcut, of_affine[0], of_affine[1]
+
+
+def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def _rows(x: Tensor) -> tuple[object, ...]:
+    """The last arguments of the norm's functions for maps (..., F, B)."""
+    fields, batch = x.shape[-2:]
+    sizes = (x.numel() // (fields * batch), fields, batch)
+    return int(x.dtype == torch.float64), *map(ctypes.c_int64, sizes), torch.get_num_threads()

@@ -1,0 +1,103 @@
+"""Batch norm of regular C4 fields, in both layouts."""
+
+import torch
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from i2i.nn import native
+from i2i.nn.batch_norm import JointBatchNorm2d, update_running
+from i2i.nn.c4_basis import TURNS
+from i2i.nn.processes import num_processes
+
+
+class C4BatchNorm(JointBatchNorm2d):
+    """Batch norm with one affine pair per regular field, statistics pooled over the four turns.
+
+    Where processes share a batch, the statistics are those of all of it.
+
+    Shape:
+        (B, 4 · num_fields, H, W) -> the same.
+
+    Example:
+        >>> C4BatchNorm(3)(torch.randn(2, 12, 5, 5)).shape
+        torch.Size([2, 12, 5, 5])
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Normalise `input` (B, 4 · num_fields, H, W)."""
+        batch, channels, height, width = input.shape
+        # One row per field: (B, F, 4·H, W), a view of a contiguous tensor. torch's channels-last
+        # batch norm is much less accurate in float32: rows are made contiguous where they are not.
+        rows = input.reshape(batch, channels // TURNS, TURNS * height, width)
+        return super().forward(rows).view(batch, channels, height, width)
+
+    def pixel_major(
+        self, x: Tensor, *, shortcut: Tensor | None = None, relu: bool = False
+    ) -> Tensor:
+        """The same on pixel-major maps (pixels, 4, num_fields, B), then add and clip."""
+        if self._is_compiled(x):
+            return self._compiled(x, shortcut, relu=relu)
+        out = super().forward(x.view(-1, *x.shape[2:], 1))
+        if shortcut is not None:
+            out = out.add_(shortcut.view(out.shape))
+        # Before the view: autograd would copy around an operation in place on one.
+        return (torch.relu_(out) if relu else out).view(x.shape)
+
+    def _is_compiled(self, x: Tensor) -> bool:
+        """Whether `native` does it: not where processes share moments or these are constants."""
+        if self.running_mean is None or x.dtype != self.weight.dtype:
+            return False
+        if not native.is_built_for(x, x.dtype):
+            return False
+        return num_processes() == 1 if self.training else not torch.is_grad_enabled()
+
+    def _compiled(self, x: Tensor, shortcut: Tensor | None, *, relu: bool) -> Tensor:
+        if not self.training:
+            mean, var = self.running_mean, self.running_var
+            assert mean is not None
+            assert var is not None
+            moments = torch.stack([mean, var]).double()
+            return native.norm(
+                x, shortcut, self.weight, self.bias, moments, eps=self.eps, relu=relu, fresh=False
+            )
+        moments = x.new_empty(2, self.num_features, dtype=torch.float64)
+        out: Tensor = _Norm.apply(x, shortcut, self.weight, self.bias, moments, self.eps, relu)
+        count = moments.new_tensor(x.numel() / self.num_features)
+        update_running(self, moments[0], moments[1], count=count)
+        return out
+
+
+class _Norm(torch.autograd.Function):
+    """relu(norm(x) + shortcut); what is taken for `moments` (2, F) is written there."""
+
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx,
+        x: Tensor,
+        shortcut: Tensor | None,
+        weight: Tensor,
+        bias: Tensor,
+        moments: Tensor,
+        eps: float,
+        relu: bool,
+    ) -> Tensor:
+        x = x.contiguous()
+        y = native.norm(x, shortcut, weight, bias, moments, eps=eps, relu=relu, fresh=True)
+        ctx.save_for_backward(x, weight, moments, *([y] if relu else []))
+        ctx.eps, ctx.has_shortcut = eps, shortcut is not None  # type: ignore[attr-defined]
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, moments, *clipped = ctx.saved_tensors  # type: ignore[attr-defined]
+        of_x, of_shortcut, of_weight, of_bias = native.norm_backward(
+            grad,
+            clipped[0] if clipped else None,
+            x,
+            weight,
+            moments,
+            eps=ctx.eps,  # type: ignore[attr-defined]
+            has_shortcut=ctx.has_shortcut,  # type: ignore[attr-defined]
+        )
+        return of_x, of_shortcut, of_weight.to(weight), of_bias.to(weight), None, None, None
