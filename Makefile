@@ -47,4 +47,4 @@ bench: $(VENV)/.installed
 		$(PY) benchmarks/$$name.py || exit 1; done
 
 clean:
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) build dist src/i2i/nn/native/*.so

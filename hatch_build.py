@@ -1,14 +1,19 @@
 """Compiles `src/i2i/nn/native` while i2i is installed, where a C++ compiler is found.
 
 One library for each instruction set; at run time i2i takes the one of the processor. Without a
-compiler nothing is built, and torch does what the library would: the same function, slower.
+compiler, or with I2I_NO_COMPILER=1, nothing is built, and torch does what the library would: the
+same function, slower.
 """
 
+import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
+import sysconfig
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -31,35 +36,52 @@ class BuildHook(BuildHookInterface):
 
     def initialize(self, version: str, build_data: dict) -> None:
         """Called by hatchling before the wheel is written."""
-        built = self._build()
+        built = build(self.app.display_warning)
         if built and version != "editable":
             build_data["artifacts"] += [f"/{path.relative_to(self.root)}" for path in built]
-            build_data["pure_python"], build_data["infer_tag"] = False, True
+            build_data["pure_python"] = False
+            # They know nothing of Python: one wheel a platform.
+            tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+            build_data["tag"] = f"py3-none-{tag}"
 
-    def _build(self) -> list[Path]:
-        compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++")
-        if not compiler:
-            self.app.display_warning("i2i: no C++ compiler, so its fast transforms are not built")
-            return []
-        variants = X86 if platform.machine().lower() in ("x86_64", "amd64") else OTHERS
-        targets = {FOLDER / f"c4_spectral_{name}.so": flags for name, flags in variants.items()}
-        stale = {path: flags for path, flags in targets.items() if not _is_current(path)}
-        with ThreadPoolExecutor() as pool:
-            list(pool.map(partial(self._compile, compiler), stale, stale.values()))
-        return [path for path in targets if _is_current(path)]
 
-    def _compile(self, compiler: str, target: Path, flags: list[str]) -> None:
-        # Replaced in one move: a process that has the old library open keeps it.
-        with tempfile.TemporaryDirectory(dir=FOLDER) as folder:
+def build(warn: Callable[[str], None], folder: Path = FOLDER) -> list[Path]:
+    """Compile what is missing in ``folder``; what cannot be compiled is told to ``warn``."""
+    compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++")
+    if os.environ.get("I2I_NO_COMPILER") or not compiler:
+        warn("i2i: no C++ compiler, so its fast transforms are not built")
+        return []
+    variants = X86 if platform.machine().lower() in ("x86_64", "amd64") else OTHERS
+    digest = digest_of(folder)
+    targets = {folder / f"c4_spectral_{name}_{digest}.so": name for name in variants}
+    for old in set(folder.glob("c4_spectral_*.so")) - set(targets):
+        old.unlink(missing_ok=True)
+    missing = {path: variants[name] for path, name in targets.items() if not path.exists()}
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(partial(_compile, shlex.split(compiler), warn), missing, missing.values()))
+    return [path for path in targets if path.exists()]
+
+
+def digest_of(folder: Path) -> str:
+    """Of the sources: a library is found only by those that it was made from."""
+    sources = sorted([*folder.glob("*.cpp"), *folder.glob("*.h")])
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+
+
+def _compile(
+    compiler: list[str], warn: Callable[[str], None], target: Path, flags: list[str]
+) -> None:
+    sources = [str(path) for path in target.parent.glob("*.cpp")]
+    try:
+        # Moved to its place in one step: another build may be making the same.
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             new = Path(folder) / target.name
-            command = [compiler, *FLAGS, *flags, "-o", str(new), *map(str, FOLDER.glob("*.cpp"))]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                self.app.display_warning(f"i2i: {target.name} is not built: {done.stderr[-500:]}")
-            else:
-                new.replace(target)
-
-
-def _is_current(target: Path) -> bool:
-    sources = [Path(__file__), *FOLDER.glob("*.cpp"), *FOLDER.glob("*.h")]
-    return target.exists() and all(p.stat().st_mtime < target.stat().st_mtime for p in sources)
+            subprocess.run(
+                [*compiler, *FLAGS, *flags, "-o", str(new), *sources],
+                capture_output=True, text=True, check=True,
+            )  # fmt: skip
+            new.replace(target)
+    except subprocess.CalledProcessError as error:
+        warn(f"i2i: {target.name} is not built: {error.stderr[-500:]}")
+    except OSError as error:
+        warn(f"i2i: {target.name} is not built: {error}")

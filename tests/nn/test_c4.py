@@ -10,12 +10,12 @@ from torch import nn
 
 from i2i.nn.c4 import (
     BASES,
-    C4BatchNorm,
     C4Conv,
     group_max_pool,
     regular_type,
     trivial_type,
 )
+from i2i.nn.c4_norm import C4BatchNorm
 from i2i.testing import assert_c4_equivariant, turn_regular_map
 
 with warnings.catch_warnings():

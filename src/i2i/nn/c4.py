@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from i2i.nn.c4_basis import TURNS, full_basis, symmetrise
-from i2i.nn.c4_dispatch import is_traced
 from i2i.nn.c4_spectral import (
     product_dtype,
     spectral_conv_pixel_major,
@@ -25,6 +24,7 @@ from i2i.nn.c4_spectral import (
     transform_filters,
     transform_matrix,
 )
+from i2i.nn.native import is_traced
 from i2i.nn.precision import full_precision
 
 with warnings.catch_warnings():

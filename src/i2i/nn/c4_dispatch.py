@@ -7,11 +7,10 @@ one, for comparisons and for tools that look at the layers from outside.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
 from torch import Tensor
 
-from i2i.nn.c4_spectral import is_supported
-from i2i.nn.native import has_compiled_transform
+from i2i.nn.c4_spectral import is_supported, product_dtype
+from i2i.nn.native import has_compiled_transform, is_built_for, is_traced
 
 MODES = ("auto", "dense", "spectral")
 _MODE = ["auto"]
@@ -55,11 +54,6 @@ def convolution_mode(mode: str) -> Iterator[None]:
         _MODE[0] = before
 
 
-def is_traced() -> bool:
-    """Whether a compiler or tracer is watching, which cannot follow the spectral form."""
-    return torch.compiler.is_compiling() or torch.jit.is_tracing()
-
-
 def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> bool:
     """Whether 3×3 convolutions of stride 1 on such maps go through the spectrum.
 
@@ -76,10 +70,14 @@ def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> 
     least = _LEAST_BATCH_TRAINING if training else _LEAST_BATCH_CACHED
     return (
         x.device.type == "cpu"
-        and (map_size <= _LARGEST_MAP or has_compiled_transform(map_size))
+        and (map_size <= _LARGEST_MAP or _is_compiled(x, map_size))
         and fields >= _LEAST_FIELDS
         and len(x) >= least
     )
+
+
+def _is_compiled(x: Tensor, map_size: int) -> bool:
+    return has_compiled_transform(map_size) and is_built_for(x, product_dtype(x))
 
 
 def takes_product(image: Tensor) -> bool:

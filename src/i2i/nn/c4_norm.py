@@ -35,19 +35,22 @@ class C4BatchNorm(JointBatchNorm2d):
         self, x: Tensor, *, shortcut: Tensor | None = None, relu: bool = False
     ) -> Tensor:
         """The same on pixel-major maps (pixels, 4, num_fields, B), then add and clip."""
-        if self._is_compiled(x):
+        if self._is_compiled(x, shortcut):
             return self._compiled(x, shortcut, relu=relu)
-        out = super().forward(x.view(-1, *x.shape[2:], 1))
+        out = super().forward(x.flatten(0, 1)[..., None])
         if shortcut is not None:
             out = out.add_(shortcut.view(out.shape))
         # Before the view: autograd would copy around an operation in place on one.
         return (torch.relu_(out) if relu else out).view(x.shape)
 
-    def _is_compiled(self, x: Tensor) -> bool:
+    def _is_compiled(self, x: Tensor, shortcut: Tensor | None) -> bool:
         """Whether `native` does it: not where processes share moments or these are constants."""
-        if self.running_mean is None or x.dtype != self.weight.dtype:
+        if self.running_mean is None or self.weight is None:
             return False
-        if not native.is_built_for(x, x.dtype):
+        fits = x.dtype == self.weight.dtype and x.shape[-2] == self.num_features
+        if shortcut is not None:
+            fits &= (shortcut.shape, shortcut.dtype) == (x.shape, x.dtype)
+        if not fits or not native.is_built_for(x, x.dtype):
             return False
         return num_processes() == 1 if self.training else not torch.is_grad_enabled()
 
@@ -84,7 +87,7 @@ class _Norm(torch.autograd.Function):
         x = x.contiguous()
         y = native.norm(x, shortcut, weight, bias, moments, eps=eps, relu=relu, fresh=True)
         ctx.save_for_backward(x, weight, moments, *([y] if relu else []))
-        ctx.eps, ctx.has_shortcut = eps, shortcut is not None  # type: ignore[attr-defined]
+        ctx.eps = eps  # type: ignore[attr-defined]
         return y
 
     @staticmethod
@@ -98,6 +101,6 @@ class _Norm(torch.autograd.Function):
             weight,
             moments,
             eps=ctx.eps,  # type: ignore[attr-defined]
-            has_shortcut=ctx.has_shortcut,  # type: ignore[attr-defined]
+            has_shortcut=ctx.needs_input_grad[1],  # type: ignore[attr-defined]
         )
         return of_x, of_shortcut, of_weight.to(weight), of_bias.to(weight), None, None, None

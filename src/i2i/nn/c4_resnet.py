@@ -255,13 +255,17 @@ class C4ResNet18(nn.Module):
 
         The first block of a stretch changes the size of the map, which is done densely.
         """
+        chosen = [
+            takes_spectral(x, fields=fields, map_size=size, training=torch.is_grad_enabled())
+            for _, _, fields, size in self._stretches
+        ]
+        if not any(chosen):
+            return self.blocks(x), False
         is_pixel_major = False
-        for first, end, fields, map_size in self._stretches:
+        for (first, end, _, _), spectral in zip(self._stretches, chosen, strict=True):
             if is_pixel_major:
                 x = from_pixel_major(x)
-            is_pixel_major = takes_spectral(
-                x, fields=fields, map_size=map_size, training=torch.is_grad_enabled()
-            )
+            is_pixel_major = spectral
             for index in range(first, end):
                 block = self.blocks[index]
                 assert isinstance(block, C4BasicBlock)

@@ -72,6 +72,9 @@ __all__ = [
 ]  # fmt: skip
 
 
+_ORBITS_AT_ONCE = 4
+
+
 def base_filters(kernel: Tensor) -> Tensor:
     """Take the first group row K[0, j] of an expanded C4 kernel.
 
@@ -91,12 +94,9 @@ def _multiply(blocks: Tensor, spectrum: Spectrum) -> Spectrum:
 
 def _coefficient_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor) -> Tensor:
     """dL/d(coefficients), (C_out, C_in, K)."""
+    # A few orbits after the other: dA is never whole.
     if native.is_built_for(matrix, upstream[0].dtype):
-        gradient = upstream[1].new_empty(len(upstream[0]) + 1, len(upstream[1]), len(spectrum[1]))
-        torch.bmm(upstream[0], spectrum[0].mT, out=gradient[:-1])
-        torch.mm(upstream[1], spectrum[1].mT, out=gradient[-1])
-        return native.coefficient_gradient(gradient, matrix)
-    # One orbit after the other: dA is never whole.
+        return _compiled_gradient(upstream, spectrum, matrix)
     out_size, in_size = len(upstream[1]), len(spectrum[1])
     out_fields, in_fields = out_size // ORDER, in_size // ORDER
     total = matrix.new_zeros(out_fields, matrix.shape[1], in_fields)
@@ -106,6 +106,24 @@ def _coefficient_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor
         torch.mm(left, right.mT, out=block)
         pairs = block.view(out_fields, ORDER**2, in_fields).to(matrix.dtype)
         total.baddbmm_(part.mT.expand(out_fields, -1, -1), pairs)
+    return total.mT.contiguous()
+
+
+def _compiled_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor) -> Tensor:
+    """:func:`_coefficient_gradient` by `native`."""
+    out_size, in_size = len(upstream[1]), len(spectrum[1])
+    total = matrix.new_zeros(out_size // ORDER, matrix.shape[1], in_size // ORDER)
+    block = upstream[1].new_empty(_ORBITS_AT_ONCE, out_size, in_size)
+    orbits = len(upstream[0])
+    for first in range(0, orbits, _ORBITS_AT_ONCE):
+        some = slice(first, min(first + _ORBITS_AT_ONCE, orbits))
+        part = block[: some.stop - first]
+        torch.bmm(upstream[0][some], spectrum[0][some].mT, out=part)
+        native.add_coefficient_gradient(
+            total, part, matrix[ORDER**2 * first : ORDER**2 * some.stop]
+        )
+    torch.mm(upstream[1], spectrum[1].mT, out=block[0])
+    native.add_coefficient_gradient(total, block[:1], matrix[ORDER**2 * orbits :])
     return total.mT.contiguous()
 
 
@@ -189,7 +207,12 @@ def transform_filters(
         Blocks, shape ((N^2 - 1) / 4 + 1, 4 * C_out, 4 * C_in), w = 0 last; rows (field, s'|e', h),
         columns (s|e, g, field).
     """
-    if native.is_built_for(coefficients, dtype or coefficients.dtype):
+    fitting = coefficients.shape[2] == matrix.shape[1] and coefficients.dtype == matrix.dtype
+    if (
+        fitting
+        and coefficients.device == matrix.device
+        and native.is_built_for(coefficients, dtype or coefficients.dtype)
+    ):
         return native.blocks(coefficients, matrix, dtype or coefficients.dtype)
     (out_fields, in_fields), parts = coefficients.shape[:2], matrix.split(ORDER**2)
     columns = coefficients.mT.contiguous()  # (C_out, K, C_in)

@@ -48,7 +48,11 @@ def synthesise(
 
 def _is_native(maps: Tensor, dtype: torch.dtype, kernel_size: int) -> bool:
     map_size = math.isqrt(len(maps))
-    return native.is_built_for(maps, dtype) and native.has_compiled_transform(map_size, kernel_size)
+    return (
+        maps.shape[:2] == (map_size**2, ORDER)
+        and native.is_built_for(maps, dtype)
+        and native.has_compiled_transform(map_size, kernel_size)
+    )
 
 
 def _turns(half: int, slot: int) -> tuple[tuple[int, int, float], tuple[int, int, float]]:

@@ -26,7 +26,8 @@ def from_pixel_major(x: Tensor) -> Tensor:
 
 
 def _turn_over(x: Tensor, to_pixel_major: bool) -> Tensor:
-    if native.is_built_for(x, x.dtype):
+    fits = x.shape[1] % ORDER == 0 if to_pixel_major else x.shape[1] == ORDER
+    if fits and native.is_built_for(x, x.dtype):
         return native.turn_over(x, to_pixel_major=to_pixel_major)
     if to_pixel_major:
         return x.unflatten(1, (-1, ORDER)).permute(3, 2, 1, 0).contiguous()

@@ -8,11 +8,12 @@ with torch.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
+import hashlib
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -31,15 +32,16 @@ _ENABLED = [True]
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The library for this processor, or None."""
-    capability = torch.backends.cpu.get_cpu_capability().lower()
-    path = Path(__file__).with_name(f"c4_spectral_{capability}.so")
-    if not path.exists():
-        return None
-    try:
-        return ctypes.CDLL(str(path))
-    except OSError:
-        return None
+    """The library for this processor that was made from the sources as they are, or None."""
+    folder = Path(__file__).parent
+    sources = sorted([*folder.glob("*.cpp"), *folder.glob("*.h")])
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    for name in (torch.backends.cpu.get_cpu_capability().lower(), "default"):
+        path = folder / f"c4_spectral_{name}_{digest}.so"
+        if path.exists():
+            with contextlib.suppress(OSError):
+                return ctypes.CDLL(str(path))
+    return None
 
 
 def _library() -> ctypes.CDLL:
@@ -48,7 +50,7 @@ def _library() -> ctypes.CDLL:
     return found
 
 
-@contextmanager
+@contextlib.contextmanager
 def torch_only() -> Iterator[None]:
     """Leave the library aside for a while, for comparisons.
 
@@ -64,12 +66,23 @@ def torch_only() -> Iterator[None]:
         _ENABLED[0] = before
 
 
+def is_traced() -> bool:
+    """Whether a compiler or tracer is watching."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()
+
+
 def is_built_for(tensor: Tensor, dtype: torch.dtype) -> bool:
-    """Whether the library takes maps or coefficients to spectra or blocks of `dtype`."""
+    """Whether the library takes maps or coefficients to spectra or blocks of `dtype`.
+
+    Not what a tracer or compiler watches: it would not see what is written.
+    """
     return (
         _ENABLED[0]
         and tensor.device.type == "cpu"
         and (tensor.dtype, dtype) in _TYPES
+        and tensor.numel() > 0
+        and type(tensor) in (Tensor, torch.nn.Parameter)
+        and not is_traced()
         and library() is not None
     )
 
@@ -90,10 +103,11 @@ def _tables(map_size: int, size: int, dtype: torch.dtype) -> tuple[Tensor, Tenso
         for w in ((a, b), (-b, a)):
             frequencies.append([abs(part) for part in w] + [1 if part >= 0 else -1 for part in w])
     half = (map_size + 1) // 2
-    distance = torch.arange(half, dtype=torch.float64) + (0.5 if map_size % 2 == 0 else 0.0)
-    angle = torch.arange(middle + 1, dtype=torch.float64)[:, None] * distance * (2 * math.pi / size)
+    distance = torch.arange(half, dtype=torch.float64, device="cpu") + (0.5 - 0.5 * (map_size % 2))
+    angle = torch.arange(middle + 1, dtype=torch.float64, device="cpu")[:, None] * distance
+    angle = angle * (2 * math.pi / size)
     waves = torch.stack([angle.cos(), angle.sin()]) / math.sqrt(size)
-    table = torch.tensor(frequencies, dtype=torch.int32).view(-1, 2, 4)
+    table = torch.tensor(frequencies, dtype=torch.int32, device="cpu").view(-1, 2, 4)
     return table.contiguous(), waves.to(dtype).contiguous()
 
 
@@ -127,7 +141,7 @@ def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
     """(B, 4 C, P) to (P, 4, C, B), or back; float32 or float64 where :func:`is_built_for`."""
     maps = maps.contiguous()
     rows, columns = maps.shape[0], maps.shape[-1]
-    fields = maps[0].numel() // (ORDER * columns)
+    fields = maps.shape[1] // ORDER if to_pixel_major else maps.shape[2]
     shape = (columns, ORDER, fields, rows) if to_pixel_major else (columns, fields * ORDER, rows)
     result = maps.new_empty(shape)
     _library().i2i_turn_over(
@@ -149,28 +163,31 @@ def blocks(coefficients: Tensor, matrix: Tensor, dtype: torch.dtype) -> Tensor:
     orbits = len(matrix) // ORDER**2
     result = coefficients.new_empty(orbits, ORDER * out_fields, ORDER * in_fields, dtype=dtype)
     columns = coefficients.mT.contiguous()  # (C_out, K, C_in)
-    _filters_call("i2i_blocks", columns, matrix, result)
+    _filters_call("i2i_blocks", columns, matrix, result, columns, result)
     return result
 
 
-def coefficient_gradient(upstream: Tensor, matrix: Tensor) -> Tensor:
-    """dL/d(coefficients), (C_out, C_in, K), from that of the blocks (n + 1, 4 C_out, 4 C_in)."""
-    _, rows, columns = upstream.shape
-    gradient = matrix.new_zeros(rows // ORDER, matrix.shape[1], columns // ORDER)
-    _filters_call("i2i_coefficient_gradient", gradient, matrix, upstream.contiguous())
-    return gradient.mT.contiguous()
+def add_coefficient_gradient(total: Tensor, upstream: Tensor, matrix: Tensor) -> None:
+    """Add dL/d(coefficients) to ``total`` (C_out, K, C_in).
+
+    Args:
+        total: In the dtype of ``matrix``, contiguous.
+        upstream: dL/d(blocks) of some orbits (m, 4 C_out, 4 C_in).
+        matrix: Their rows of the transform matrix (16 m, K).
+    """
+    upstream = upstream.contiguous()
+    _filters_call("i2i_coefficient_gradient", upstream, matrix, total, total, upstream)
 
 
-def _filters_call(name: str, coefficients: Tensor, matrix: Tensor, blocks: Tensor) -> None:
-    """Both directions between coefficients (C_out, K, C_in) and blocks."""
-    out_fields, count, in_fields = coefficients.shape
-    entries = matrix.view(-1, ORDER**2, matrix.shape[1]).mT.contiguous()  # (n + 1, K, 16)
-    left, right = (blocks, coefficients) if "gradient" in name else (coefficients, blocks)
+def _filters_call(
+    name: str, source: Tensor, matrix: Tensor, target: Tensor, columns: Tensor, blocks: Tensor
+) -> None:
+    """From ``source`` to ``target``: columns (C_out, K, C_in) and blocks, or the reverse."""
+    out_fields, count, in_fields = columns.shape
+    entries = matrix.view(-1, ORDER**2, matrix.shape[1]).mT.contiguous()  # (m, K, 16)
     getattr(_library(), name)(
-        _pointer(left),
-        _pointer(entries),
-        _pointer(right),
-        _TYPES[coefficients.dtype, blocks.dtype],
+        *map(_pointer, (source, entries, target)),
+        _TYPES[columns.dtype, blocks.dtype],
         ctypes.c_int64(len(entries)),
         ctypes.c_int64(out_fields),
         ctypes.c_int64(in_fields),
@@ -204,7 +221,8 @@ def _call(
         _pointer(waves),
         torch.get_num_threads(),
     )
-    assert status == 0, f"{name} is not built for {map_size} x {map_size} maps"
+    if status:
+        raise RuntimeError(f"{name} is not built for {map_size} x {map_size} maps")
 
 
 def norm(
@@ -260,14 +278,14 @@ def norm_backward(
     grad, weight = grad.contiguous(), weight.contiguous()
     of_x = torch.empty_like(x)
     of_shortcut = torch.empty_like(x) if has_shortcut else None
-    of_affine = torch.empty_like(moments)
+    of_weight, of_bias = torch.empty_like(moments[0]), torch.empty_like(moments[0])
     _library().i2i_norm_backward(
         *map(_pointer, (grad, clipped, x, weight, *moments)),
-        *map(_pointer, (of_x, of_shortcut, *of_affine)),
+        *map(_pointer, (of_x, of_shortcut, of_weight, of_bias)),
         ctypes.c_double(eps),
         *_rows(x),
     )
-    return of_x, of_shortcut, of_affine[0], of_affine[1]
+    return of_x, of_shortcut, of_weight, of_bias
 
 
 def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
@@ -276,6 +294,5 @@ def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
 
 def _rows(x: Tensor) -> tuple[object, ...]:
     """The last arguments of the norm's functions for maps (..., F, B)."""
-    fields, batch = x.shape[-2:]
-    sizes = (x.numel() // (fields * batch), fields, batch)
+    sizes = (math.prod(x.shape[:-2]), *x.shape[-2:])
     return int(x.dtype == torch.float64), *map(ctypes.c_int64, sizes), torch.get_num_threads()

@@ -90,13 +90,14 @@ void forward(const T* x, const T* shortcut, const T* weight, const T* bias, doub
       variance[field] = sums[1] / shape.count() - rest * rest;
     }
     const double factor = weight[field] / std::sqrt(variance[field] + epsilon);
-    const T scale = static_cast<T>(factor), shift = static_cast<T>(bias[field] - mean[field] * factor);
+    const T scale = static_cast<T>(factor), middle = static_cast<T>(mean[field]);
+    const T shift = static_cast<T>(bias[field] + (middle - mean[field]) * factor);
     for (int64_t row = 0; row < shape.rows; ++row) {
       const int64_t start = shape.at(row, field);
       for (int64_t image = 0; image < shape.batch; image += size) {
         const int64_t at = start + image;
         const int count = shape.left(image, size);
-        Vec value = scale * load_one<T>(x + at, count) + shift;
+        Vec value = scale * (load_one<T>(x + at, count) - middle) + shift;
         if (shortcut) value += load_one<T>(shortcut + at, count);
         if (relu) value = value < 0 ? Vec{} : value;  // keeps what is not a number
         store_one<T>(y + at, count, value, in_lines);
@@ -118,7 +119,7 @@ void backward(const T* grad, const T* y, const T* x, const T* weight, const doub
   for (int64_t field = 0; field < shape.fields; ++field) {
     const auto upstream = [&](int64_t at, int count) {
       const Vec g = load_one<T>(grad + at, count);
-      return y ? (load_one<T>(y + at, count) > 0 ? g : Vec{}) : g;
+      return y ? (load_one<T>(y + at, count) <= 0 ? Vec{} : g) : g;  // past the end both are zero
     };
     const double inverse = 1 / std::sqrt(variance[field] + epsilon);
     const T middle = static_cast<T>(mean[field]);

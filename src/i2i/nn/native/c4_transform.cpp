@@ -261,12 +261,10 @@ void synthesise(const S* main, const S* zero, T* maps, const Shape& shape,
 
 // ---- the sizes and types that are built ----
 
-enum Type { kFloat = 0, kBfloat16 = 1, kDouble = 2 };
-
-
 struct Call {
   const void* source;
-  void *target, *zero;
+  void* target;
+  void* zero;  // read by synthesis, written by analysis
   Shape shape;
   const int32_t* frequencies;
   const void* waves;
@@ -274,44 +272,39 @@ struct Call {
 };
 
 struct Analyse : Call {
-  template <int H, int M>
-  int operator()(int type) const {
-    if (type == kFloat) return run<float, float, H, M>();
-    if (type == kBfloat16) return run<float, uint16_t, H, M>();
-    return run<double, double, H, M>();
-  }
   template <class T, class S, int H, int M>
-  int run() const {
+  void run() const {
     analyse<T, S, H, M>(static_cast<const T*>(source), static_cast<S*>(target),
                         static_cast<S*>(zero), shape, frequencies, waves, threads);
-    return 0;
   }
 };
 
 struct Synthesise : Call {
-  template <int H, int M>
-  int operator()(int type) const {
-    if (type == kFloat) return run<float, float, H, M>();
-    if (type == kBfloat16) return run<float, uint16_t, H, M>();
-    return run<double, double, H, M>();
-  }
   template <class T, class S, int H, int M>
-  int run() const {
+  void run() const {
     synthesise<T, S, H, M>(static_cast<const S*>(source), static_cast<const S*>(zero),
                            static_cast<T*>(target), shape, frequencies, waves, threads);
-    return 0;
   }
 };
+
+// 0: float; 1: float, with a spectrum of bfloat16; 2: double.
+template <int H, int M, class Act>
+int for_type(int type, const Act& act) {
+  if (type == 0) act.template run<float, float, H, M>();
+  if (type == 1) act.template run<float, uint16_t, H, M>();
+  if (type == 2) act.template run<double, double, H, M>();
+  return 0;
+}
 
 template <class Act>
 int for_size(int map_size, int padded_size, int type, const Act& act) {
   switch (map_size * 100 + padded_size) {
-    case 405: return act.template operator()<4, 2>(type);
-    case 507: return act.template operator()<5, 3>(type);
-    case 809: return act.template operator()<8, 4>(type);
-    case 911: return act.template operator()<9, 5>(type);
-    case 1617: return act.template operator()<16, 8>(type);
-    case 1719: return act.template operator()<17, 9>(type);
+    case 405: return for_type<4, 2>(type, act);
+    case 507: return for_type<5, 3>(type, act);
+    case 809: return for_type<8, 4>(type, act);
+    case 911: return for_type<9, 5>(type, act);
+    case 1617: return for_type<16, 8>(type, act);
+    case 1719: return for_type<17, 9>(type, act);
     default: return 1;
   }
 }

@@ -47,8 +47,8 @@ inline Floats from_memory(Halves half) {
   return v;
 }
 
-// Past the caches. All rows of a spectrum lie a multiple of 4 KiB apart where the number of fields is
-// one of 4: in a cache they would drive each other out, and what is read between them as well.
+// Past the caches. With 64 images the orbits of a spectrum lie a multiple of 4 KiB apart: in a cache
+// they would drive each other out, and what is read between them as well.
 inline void stream_line(void* to, const void* line) {
 #if defined(__AVX512F__)
   _mm512_stream_si512(static_cast<__m512i*>(to), _mm512_loadu_si512(line));
