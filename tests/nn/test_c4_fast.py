@@ -221,6 +221,11 @@ def test_which_form_is_taken():
         assert takes_spectral(x, fields=76, map_size=16, training=True) == compiled
         assert not takes_spectral(x, fields=76, map_size=15, training=True)
         assert not takes_spectral(x[:1], fields=76, map_size=8, training=False)
+        for training, (least_torch, least_compiled) in ((True, (16, 8)), (False, (8, 2))):
+            least = least_compiled if compiled else least_torch
+            for count in (least - 1, least):
+                taken = takes_spectral(x[:count], fields=76, map_size=8, training=training)
+                assert taken == (count == least)
         with convolution_mode("dense"):
             assert not takes_spectral(x, fields=76, map_size=8, training=True)
         with convolution_mode("spectral"):

@@ -15,11 +15,11 @@ from i2i.nn.native import has_compiled_transform, is_built_for, is_traced
 MODES = ("auto", "dense", "spectral")
 _MODE = ["auto"]
 
-# Images below which transforming costs more than it saves: in training the filters are transformed
-# at every step, in evaluation once. Chosen from runs of the whole network (benchmarks/
-# network_speed.py, which times batches of 1, 8 and 64), not searched for in between.
-_LEAST_BATCH_TRAINING = 16
-_LEAST_BATCH_CACHED = 8
+# Images below which transforming costs more than it saves, without and with compiled transforms: in
+# training the filters are transformed at every step, in evaluation once. Chosen from runs of the
+# whole network at powers of two (benchmarks/network_speed.py times batches of 1, 8 and 64).
+_LEAST_BATCH_TRAINING = (16, 8)
+_LEAST_BATCH_CACHED = (8, 2)
 _LEAST_FIELDS = 16
 _LARGEST_MAP = 9  # 16 × 16 maps gain little, and lose in bfloat16, unless transforms are compiled
 
@@ -67,17 +67,14 @@ def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> 
         return False
     if _MODE[0] == "spectral":
         return True
+    compiled = has_compiled_transform(map_size) and is_built_for(x, product_dtype(x))
     least = _LEAST_BATCH_TRAINING if training else _LEAST_BATCH_CACHED
     return (
         x.device.type == "cpu"
-        and (map_size <= _LARGEST_MAP or _is_compiled(x, map_size))
+        and (map_size <= _LARGEST_MAP or compiled)
         and fields >= _LEAST_FIELDS
-        and len(x) >= least
+        and len(x) >= least[compiled]
     )
-
-
-def _is_compiled(x: Tensor, map_size: int) -> bool:
-    return has_compiled_transform(map_size) and is_built_for(x, product_dtype(x))
 
 
 def takes_product(image: Tensor) -> bool:
