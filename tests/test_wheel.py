@@ -64,3 +64,11 @@ def test_the_installed_package_composes_and_shows_its_help(installed):
     text = run(installed, "from i2i.train import main; main()", "--help")
     assert "model=i2i task=pose data=shapenet_bed" in text
     assert "shapenet55" in text
+
+
+def test_the_installed_package_brings_its_compiled_code(installed):
+    from i2i.nn import native
+
+    printed = run(installed, "from i2i.nn import native; print(native.library())")
+    assert ("None" in printed) == (native.library() is None)
+    assert native.library() is None or str(installed) in printed
