@@ -17,17 +17,7 @@ from i2i.nn.c4_stem import stem_map
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 from i2i.runs.building import build_network, info_of
 
-
-@pytest.fixture(params=["compiled", "torch"], autouse=True)
-def _form(request):
-    """Everything here holds for the compiled transforms and for torch's."""
-    if request.param == "compiled":
-        if native.library() is None:
-            pytest.skip("no compiler was found when i2i was installed")
-        yield
-    else:
-        with native.torch_only():
-            yield
+pytestmark = pytest.mark.usefixtures("both_forms")
 
 
 def relative_error(value, reference):

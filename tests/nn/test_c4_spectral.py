@@ -1,14 +1,12 @@
 """The spectral C4 convolution against torch's dense convolution and escnn's kernels."""
 
 import warnings
-from collections.abc import Iterator
 
 import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from i2i.nn import native
 from i2i.nn.c4_spectral import (
     base_filters,
     spectral_conv2d,
@@ -23,16 +21,7 @@ from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
 
 
-@pytest.fixture(params=["compiled", "torch"], autouse=True)
-def _form(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Everything here holds for the compiled transforms and for torch's."""
-    if request.param == "compiled":
-        if native.library() is None:
-            pytest.skip("no compiler was found when i2i was installed")
-        yield
-    else:
-        with native.torch_only():
-            yield
+pytestmark = pytest.mark.usefixtures("both_forms")
 
 
 def expand(base: Tensor) -> Tensor:

@@ -124,7 +124,7 @@ def analyse(
     orbits = (padded_size(math.isqrt(pixels), kernel_size) ** 2 - 1) // ORDER
     main = maps.new_empty(orbits, ORDER * fields, ORDER * batch, dtype=dtype)
     zero = maps.new_empty(ORDER * fields, batch, dtype=dtype)
-    _call("i2i_analyse", (maps, main, zero), maps, dtype, kernel_size, fields_first)
+    _transform_call("i2i_analyse", (maps, main, zero), maps, dtype, kernel_size, fields_first)
     return main, zero
 
 
@@ -133,7 +133,7 @@ def synthesise(
 ) -> Tensor:
     """Transform a spectrum back, into ``maps`` (H * H, 4, C, B), contiguous."""
     arrays = (main.contiguous(), zero.contiguous(), maps)
-    _call("i2i_synthesise", arrays, maps, main.dtype, kernel_size, fields_first)
+    _transform_call("i2i_synthesise", arrays, maps, main.dtype, kernel_size, fields_first)
     return maps
 
 
@@ -196,7 +196,7 @@ def _filters_call(
     )
 
 
-def _call(
+def _transform_call(
     name: str,
     arrays: tuple[Tensor, Tensor, Tensor],
     maps: Tensor,
