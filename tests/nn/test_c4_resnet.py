@@ -94,6 +94,9 @@ def test_disc_mask():
     )  # r² = 12.5, t² = 12.25
     assert mask[0, 0] == pytest.approx(torch.tensor(-12.25 / 4).exp().item())
     assert torch.equal(mask, torch.rot90(mask))
+    corners = disc_mask(128)
+    assert corners[0, 0] == 0.0
+    assert corners[corners > 0].min() > 1e-21  # far from what float32 cannot normalise
 
 
 def test_empty_picture_is_zero_inside():

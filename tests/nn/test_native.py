@@ -18,7 +18,9 @@ from i2i.nn.c4_spectral import (
     transform_filters,
     transform_matrix,
 )
+from i2i.nn.c4_stem import _Compiled, _Unfolded
 from i2i.nn.c4_transforms import analyse, synthesise
+from i2i.nn.native.stem import StemGeometry
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 needs_library = pytest.mark.skipif(
@@ -93,6 +95,10 @@ def test_nothing_behind_an_array_is_written(fields, batch, monkeypatch):
     native.turn_over(maps, to_pixel_major=False)
     x = maps.clone().requires_grad_()
     norm.pixel_major(x, shortcut=x, relu=True).sum().backward()
+    stem = _Compiled(torch.randn(2, 1, 4 * fields, 4 * fields), StemGeometry(5, 2, 2, 3, 2, 1))
+    stem.moments()
+    seen, kept = stem.forward(torch.randn(fields, 26), wants_places=True)
+    stem.backward(seen, *kept)
     assert len(made) > 12
     assert all((room == 7.0).all() for room in made)
     assert (back != 7.0).all()
@@ -115,8 +121,11 @@ def test_bfloat16_spectra_are_rounded_once():
 @pytest.mark.parametrize(("dtype", "spectral", "tolerance"), TYPES)
 @pytest.mark.parametrize(("outs", "ins", "count"), [(5, 3, 24), (3, 38, 36), (2, 48, 9)])
 def test_blocks_and_their_gradient_are_those_of_torch(outs, ins, count, dtype, spectral, tolerance):
+    """With zeros in the matrix, which are left out, and a row of nothing else."""
     coefficients = torch.randn(outs, ins, count, dtype=dtype)
     matrix = torch.randn(21 * 16, count, dtype=dtype)
+    matrix = torch.where(torch.rand(matrix.shape) < 0.5, 0.0, matrix)
+    matrix[5], matrix[:, 7] = 0.0, 0.0
     blocks = transform_filters(coefficients, matrix, dtype=spectral)
     expected = in_torch(transform_filters, coefficients, matrix, dtype=spectral)
     assert blocks.shape == expected.shape
@@ -134,6 +143,59 @@ def test_blocks_and_their_gradient_are_those_of_torch(outs, ins, count, dtype, s
     expected = in_torch(_coefficient_gradient, upstream, spectrum, matrix)
     assert gradient.shape == expected.shape
     assert relative_error(gradient, expected) < tolerance
+
+
+STEMS = [  # of channels in and out, image size and geometry
+    (1, 152, (32, 32), StemGeometry(5, 2, 2, 3, 2, 1)),
+    (3, 20, (33, 33), StemGeometry(5, 2, 2, 3, 2, 1)),
+    (1, 36, (24, 20), StemGeometry(4, 2, 1, 2, 2, 0)),
+    (2, 4, (17, 23), StemGeometry(3, 1, 1)),
+    (1, 8, (21, 21), StemGeometry(9, 1, 4, 5, 3, 2)),
+]
+
+
+@needs_library
+@pytest.mark.parametrize("batch", [1, 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("colours", "channels", "size", "geometry"), STEMS)
+def test_the_stem_is_that_of_torch(colours, channels, size, geometry, dtype, batch):
+    images = torch.randn(batch, colours, *size, dtype=dtype)
+    images[:, :, : size[0] // 2] = 1.0  # windows whose places are all alike
+    weight = torch.randn(channels, colours * geometry.kernel**2 + 1, dtype=dtype)
+    upstream = torch.randn(batch, channels, *geometry.out_size(*size), dtype=dtype)
+    tolerance = 2e-6 if dtype == torch.float32 else 1e-14
+
+    def outcome(stem):
+        out, kept = stem.forward(weight, wants_places=True)
+        return [stem.moments(), out, stem.backward(upstream, *kept)]
+
+    expected = outcome(_Unfolded(images, geometry))
+    assert expected[1].count_nonzero() < expected[1].numel()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        for ours, theirs in zip(outcome(_Compiled(images, geometry)), expected, strict=True):
+            assert ours.shape == theirs.shape
+            assert relative_error(ours, theirs) < tolerance
+
+
+@needs_library
+def test_the_stem_takes_the_first_of_equal_places_and_what_is_not_a_number():
+    """Where torch's max-pool looks, so that its gradient is the same."""
+    images = torch.zeros(1, 1, 12, 12)
+    images[0, 0, 5, 6], images[0, 0, 9, 2] = float("nan"), 3.0
+    weight = torch.tensor([[1.0, 0.5], [-1.0, 0.0], [-1.0, 0.25]])
+    geometry = StemGeometry(1, 1, 0, 3, 2, 1)
+    out, (places,) = _Compiled(images, geometry).forward(weight, wants_places=True)
+    maps = torch.einsum("ck,bkhw->bchw", weight, torch.cat([images, torch.ones_like(images)], 1))
+    expected, where = torch.nn.functional.max_pool2d(maps, 3, 2, 1, return_indices=True)
+    assert torch.equal(out.isnan(), expected.isnan())
+    assert torch.equal(out.nan_to_num(-1.0), expected.clamp(min=0.0).nan_to_num(-1.0))
+    rows = 2 * torch.arange(6)[:, None] - 1 + places.permute(0, 3, 1, 2) // 3
+    columns = 2 * torch.arange(6) - 1 + places.permute(0, 3, 1, 2) % 3
+    passes = out > 0
+    assert torch.equal((12 * rows + columns)[passes], where[passes])
+    assert (places.permute(0, 3, 1, 2)[~passes] == 255).all()
+    assert not passes[:, 1].any()
 
 
 @needs_library

@@ -7,9 +7,11 @@ kernel w:
 
     mean = w · E[u],        E[y²] = wᵀ E[u uᵀ] w.
 
-The batch norm is then known before the map is, folds into the kernel, and a few images at a time
-are convolved, pooled and clipped while they are in the cache. The gradient of the folded kernel
-passes on to weights, scale and shift through the two lines above.
+The batch norm is then known before the map is, folds into the kernel, and a few rows or images at
+a time are convolved, pooled and clipped while they are in the cache. The gradient of the folded
+kernel passes on to weights, scale and shift through the two lines above.
+
+A patch has a 1 at its end: with it E[u uᵀ] holds E[u] too, and the kernel its bias.
 """
 
 import torch
@@ -17,9 +19,12 @@ from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx, once_differentiable
 from torch.nn import functional
 
+from i2i.nn import native
 from i2i.nn.batch_norm import update_running
 from i2i.nn.c4 import TURNS, C4Conv
 from i2i.nn.c4_norm import C4BatchNorm
+from i2i.nn.native import stem as native_stem
+from i2i.nn.native.stem import StemGeometry
 from i2i.nn.precision import full_precision
 from i2i.nn.processes import sum_over_processes
 
@@ -38,23 +43,97 @@ def stem_map(image: Tensor, conv: C4Conv, norm: C4BatchNorm, pool: nn.Module) ->
     Returns:
         (B, conv.out_type.size, H', W'), channels last.
     """
+    geometry = StemGeometry(conv.kernel_size, conv.stride, conv.padding)
+    if isinstance(pool, nn.MaxPool2d):
+        window = (int(pool.kernel_size), int(pool.stride), int(pool.padding))  # type: ignore[arg-type]
+        geometry = StemGeometry(conv.kernel_size, conv.stride, conv.padding, *window)
     with full_precision(image):
-        image = image.to(conv.weights.dtype)
-        size, step, padding = conv.kernel_size, conv.stride, conv.padding
-        patches = functional.unfold(image, size, padding=padding, stride=step)  # (B, K, L)
+        image = image.detach().to(conv.weights.dtype).contiguous()
         kernel = conv.expand_parameters()[0].flatten(1)  # (4F, K)
-        weight, bias = _fold(kernel, norm, patches)
-        height = (image.shape[2] + 2 * padding - size) // step + 1
-        geometry = (0, 1, 0)
-        if isinstance(pool, nn.MaxPool2d):
-            geometry = (int(pool.kernel_size), int(pool.stride), int(pool.padding))  # type: ignore[arg-type]
-        return _PooledProduct.apply(patches, weight, bias, height, geometry)
+        form = _Compiled if native.is_built_for(image, image.dtype) else _Unfolded
+        stem = form(image, geometry)
+        out: Tensor = _PooledProduct.apply(_fold(kernel, norm, stem), stem)
+        return out
 
 
-def _fold(kernel: Tensor, norm: C4BatchNorm, patches: Tensor) -> tuple[Tensor, Tensor]:
-    """Kernel (4F, K) and bias (4F,) of convolution and batch norm together."""
+class _Unfolded:
+    """The images of one step, by torch: patches (B, K + 1, places) are written to memory."""
+
+    def __init__(self, images: Tensor, geometry: StemGeometry) -> None:
+        self.geometry = geometry
+        self.full = geometry.map_size(*images.shape[2:])
+        self.small = geometry.out_size(*images.shape[2:])
+        self.window = (geometry.window, geometry.window_stride, geometry.window_padding)
+        patches = functional.unfold(
+            images, geometry.kernel, padding=geometry.padding, stride=geometry.stride
+        )
+        self.patches = functional.pad(patches, (0, 0, 0, 1), value=1.0)
+
+    def moments(self) -> Tensor:
+        """Sum of u uᵀ over all patches, (K + 1, K + 1), float64."""
+        size = self.patches.shape[1]
+        total = self.patches.new_zeros(size, size, dtype=torch.float64)
+        for some in self.patches.split(_IMAGES_AT_ONCE):
+            columns = some.transpose(0, 1).reshape(size, -1).double()
+            total += columns @ columns.T
+        return total
+
+    def forward(self, weight: Tensor, *, wants_places: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """ReLU(max-pool(weight · patches)), and what its gradient needs."""
+        out = weight.new_empty(len(self.patches), *self.small, len(weight)).permute(0, 3, 1, 2)
+        places = []
+        parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (self.patches, out))
+        for some, into in zip(*parts, strict=True):
+            rows = torch.matmul(some.mT, weight.mT)  # (b, places, 4F)
+            maps = rows.view(len(some), *self.full, -1).permute(0, 3, 1, 2)
+            if self.geometry.window > 1:
+                maps, where = functional.max_pool2d(maps, *self.window, return_indices=True)
+                places += [where] if wants_places else []
+            torch.clamp(maps, min=0.0, out=into)
+        return out, (out, *places)
+
+    def backward(self, grad: Tensor, out: Tensor, *places: Tensor) -> Tensor:
+        """Gradient of the weight (4F, K + 1)."""
+        channels = out.shape[1]
+        weight = grad.new_zeros(channels, self.patches.shape[1])
+        parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (self.patches, out, grad))
+        for index, (some, kept, upstream) in enumerate(zip(*parts, strict=True)):
+            # Channels last, like the maps: a gradient of another layout is copied.
+            upstream = (upstream * (kept > 0)).contiguous(memory_format=torch.channels_last)
+            if places:
+                like = upstream.new_empty(len(some), *self.full, channels).permute(0, 3, 1, 2)
+                size, step, padding = ([side] * 2 for side in self.window)
+                upstream = torch.ops.aten.max_pool2d_with_indices_backward(
+                    upstream, like, size, step, padding, [1, 1], False, places[index]
+                )
+            rows = upstream.permute(0, 2, 3, 1).reshape(len(some), -1, channels)
+            weight += torch.bmm(rows.mT, some.mT).sum(dim=0)
+        return weight
+
+
+class _Compiled:
+    """The same by `native.stem`: a few rows of patches and maps at a time are in the cache."""
+
+    def __init__(self, images: Tensor, geometry: StemGeometry) -> None:
+        self.images, self.geometry = images, geometry
+
+    def moments(self) -> Tensor:
+        return native_stem.moments(self.images, self.geometry)
+
+    def forward(self, weight: Tensor, *, wants_places: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
+        out, places = native_stem.forward(
+            self.images, weight, self.geometry, wants_places=wants_places
+        )
+        return out, () if places is None else (places,)
+
+    def backward(self, grad: Tensor, places: Tensor) -> Tensor:
+        return native_stem.backward(self.images, grad, places, self.geometry).to(grad)
+
+
+def _fold(kernel: Tensor, norm: C4BatchNorm, stem: "_Unfolded | _Compiled") -> Tensor:
+    """Kernel and bias (4F, K + 1) of convolution and batch norm together."""
     if norm.training or norm.running_mean is None or norm.running_var is None:
-        mean, var, count = _field_moments(kernel, patches, shared=norm.training)
+        mean, var, count = _field_moments(kernel, stem.moments(), shared=norm.training)
         if norm.training:
             update_running(norm, mean, var, count=count)
     else:
@@ -62,85 +141,37 @@ def _fold(kernel: Tensor, norm: C4BatchNorm, patches: Tensor) -> tuple[Tensor, T
     scale = norm.weight.double() / (var + norm.eps).sqrt()
     shift = norm.bias.double() - scale * mean
     weight = kernel.double() * scale.repeat_interleave(TURNS)[:, None]
-    return weight.to(kernel), shift.repeat_interleave(TURNS).to(kernel)
+    return torch.cat([weight, shift.repeat_interleave(TURNS)[:, None]], dim=1).to(kernel)
 
 
 def _field_moments(
-    kernel: Tensor, patches: Tensor, *, shared: bool
+    kernel: Tensor, sums: Tensor, *, shared: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean and (biased) variance of each field's outputs, (F,), and their number, in float64.
 
     The patches' own moments are constants, so that sharing them over processes is all that the
     joint gradient needs.
     """
-    batch, size, places = patches.shape
-    first, second = kernel.new_zeros(size).double(), kernel.new_zeros(size, size).double()
-    for some in patches.detach().split(_IMAGES_AT_ONCE):
-        columns = some.transpose(0, 1).reshape(size, -1).double()
-        first += columns.sum(dim=1)
-        second += columns @ columns.T
-    rows = first.new_full((1,), batch * places)
     if shared:
-        first, second, rows = sum_over_processes(first, second, rows)
+        (sums,) = sum_over_processes(sums)
+    rows = sums[-1, -1]
     wide = kernel.double()
-    means = (wide @ (first / rows)).view(-1, TURNS).mean(dim=1)
-    squares = ((wide @ (second / rows)) * wide).sum(dim=1).view(-1, TURNS).mean(dim=1)
+    means = (wide @ (sums[-1, :-1] / rows)).view(-1, TURNS).mean(dim=1)
+    squares = ((wide @ (sums[:-1, :-1] / rows)) * wide).sum(dim=1).view(-1, TURNS).mean(dim=1)
     return means, (squares - means.square()).clamp(min=0.0), TURNS * rows
 
 
 class _PooledProduct(torch.autograd.Function):
-    """ReLU(max-pool(weight · patches + bias)), a few images at a time."""
+    """ReLU(max-pool(weight · patches)) of the images that a stem holds."""
 
     @staticmethod
-    def forward(
-        ctx: FunctionCtx,
-        patches: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-        height: int,
-        geometry: tuple[int, int, int],
-    ) -> Tensor:
-        size, step, padding = geometry
-        batch, _, places = patches.shape
-        width = places // height
-        small = (height, width)
-        if size:
-            small = tuple((side + 2 * padding - size) // step + 1 for side in small)  # type: ignore[assignment]
-        out = weight.new_empty(batch, *small, len(weight)).permute(0, 3, 1, 2)
-        wants_grad = weight.requires_grad or bias.requires_grad
-        indices = []
-        for some, into in zip(
-            patches.split(_IMAGES_AT_ONCE), out.split(_IMAGES_AT_ONCE), strict=True
-        ):
-            rows = torch.matmul(some.mT, weight.mT).add_(bias)  # (b, L, 4F)
-            maps = rows.view(len(some), height, width, -1).permute(0, 3, 1, 2)
-            if size:
-                maps, where = functional.max_pool2d(maps, size, step, padding, return_indices=True)
-                indices += [where] if wants_grad else []
-            torch.clamp(maps, min=0.0, out=into)
-        ctx.save_for_backward(patches, out, *indices)
-        ctx.small, ctx.full, ctx.geometry = small, (height, width), geometry  # type: ignore[attr-defined]
+    def forward(ctx: FunctionCtx, weight: Tensor, stem: "_Unfolded | _Compiled") -> Tensor:
+        out, kept = stem.forward(weight, wants_places=ctx.needs_input_grad[0])  # type: ignore[attr-defined]
+        ctx.save_for_backward(*kept)
+        ctx.stem = stem  # type: ignore[attr-defined]
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[None, Tensor, Tensor, None, None]:
-        patches, out, *indices = ctx.saved_tensors  # type: ignore[attr-defined]
-        (size, step, padding), full = ctx.geometry, ctx.full  # type: ignore[attr-defined]
-        channels = out.shape[1]
-        weight = grad.new_zeros(channels, patches.shape[1])
-        bias = grad.new_zeros(channels)
-        parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (patches, out, grad))
-        for index, (some, kept, upstream) in enumerate(zip(*parts, strict=True)):
-            # Channels last, like the maps: a gradient of another layout is copied.
-            upstream = (upstream * (kept > 0)).contiguous(memory_format=torch.channels_last)
-            if size:
-                like = upstream.new_empty(len(some), *full, channels).permute(0, 3, 1, 2)
-                upstream = torch.ops.aten.max_pool2d_with_indices_backward(
-                    upstream, like, [size] * 2, [step] * 2, [padding] * 2, [1, 1], False,
-                    indices[index],
-                )  # fmt: skip
-            rows = upstream.permute(0, 2, 3, 1).reshape(len(some), -1, channels)
-            weight += torch.bmm(rows.mT, some.mT).sum(dim=0)
-            bias += rows.sum(dim=(0, 1))
-        return None, weight, bias, None, None
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
+        return ctx.stem.backward(grad, *ctx.saved_tensors), None  # type: ignore[attr-defined]

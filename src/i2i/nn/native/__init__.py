@@ -44,7 +44,7 @@ def library() -> ctypes.CDLL | None:
     return None
 
 
-def _library() -> ctypes.CDLL:
+def functions() -> ctypes.CDLL:
     found = library()
     assert found is not None, "no library for this processor: ask is_built_for first"
     return found
@@ -144,9 +144,9 @@ def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
     fields = maps.shape[1] // ORDER if to_pixel_major else maps.shape[2]
     shape = (columns, ORDER, fields, rows) if to_pixel_major else (columns, fields * ORDER, rows)
     result = maps.new_empty(shape)
-    _library().i2i_turn_over(
-        _pointer(maps),
-        _pointer(result),
+    functions().i2i_turn_over(
+        pointer(maps),
+        pointer(result),
         int(to_pixel_major),
         int(maps.dtype == torch.float64),
         ctypes.c_int64(rows),
@@ -185,8 +185,8 @@ def _filters_call(
     """From ``source`` to ``target``: columns (C_out, K, C_in) and blocks, or the reverse."""
     out_fields, count, in_fields = columns.shape
     entries = matrix.view(-1, ORDER**2, matrix.shape[1]).mT.contiguous()  # (m, K, 16)
-    getattr(_library(), name)(
-        *map(_pointer, (source, entries, target)),
+    getattr(functions(), name)(
+        *map(pointer, (source, entries, target)),
         _TYPES[columns.dtype, blocks.dtype],
         ctypes.c_int64(len(entries)),
         ctypes.c_int64(out_fields),
@@ -208,8 +208,8 @@ def _transform_call(
     map_size = math.isqrt(pixels)
     size = padded_size(map_size, kernel_size)
     frequencies, waves = _tables(map_size, size, maps.dtype)
-    status = getattr(_library(), name)(
-        *map(_pointer, arrays),
+    status = getattr(functions(), name)(
+        *map(pointer, arrays),
         map_size,
         size,
         _TYPES[maps.dtype, dtype],
@@ -217,8 +217,8 @@ def _transform_call(
         ctypes.c_int64(fields),
         ctypes.c_int64(batch),
         int(fields_first),
-        _pointer(frequencies),
-        _pointer(waves),
+        pointer(frequencies),
+        pointer(waves),
         torch.get_num_threads(),
     )
     if status:
@@ -251,8 +251,8 @@ def norm(
     x, weight, bias = x.contiguous(), weight.contiguous(), bias.contiguous()
     shortcut = None if shortcut is None else shortcut.contiguous()
     y = torch.empty_like(x)
-    _library().i2i_norm(
-        *map(_pointer, (x, shortcut, weight, bias, *moments, y)),
+    functions().i2i_norm(
+        *map(pointer, (x, shortcut, weight, bias, *moments, y)),
         ctypes.c_double(eps),
         int(relu),
         int(fresh),
@@ -279,16 +279,16 @@ def norm_backward(
     of_x = torch.empty_like(x)
     of_shortcut = torch.empty_like(x) if has_shortcut else None
     of_weight, of_bias = torch.empty_like(moments[0]), torch.empty_like(moments[0])
-    _library().i2i_norm_backward(
-        *map(_pointer, (grad, clipped, x, weight, *moments)),
-        *map(_pointer, (of_x, of_shortcut, of_weight, of_bias)),
+    functions().i2i_norm_backward(
+        *map(pointer, (grad, clipped, x, weight, *moments)),
+        *map(pointer, (of_x, of_shortcut, of_weight, of_bias)),
         ctypes.c_double(eps),
         *_rows(x),
     )
     return of_x, of_shortcut, of_weight, of_bias
 
 
-def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
 
 

@@ -5,9 +5,12 @@
 //   block[n][o][r][i]    = sum_k matrix[n][k][r] coefficient[o][k][i]
 //   gradient[o][k][i]   += sum_n sum_r matrix[n][k][r] dblock[n][o][r][i]
 //
-// n: orbit, o and i: fields out and in, r: the 16 entries of a pair's block, k: coefficient.
+// n: orbit, o and i: fields out and in, r: the 16 entries of a pair's block, k: coefficient. With the
+// band-limited basis four in five of the matrix's entries are zero: they are left out.
 
+#include <algorithm>
 #include <cstdint>
+#include <vector>
 
 #include "lanes.h"
 
@@ -17,77 +20,130 @@ using namespace i2i;
 
 constexpr int kEntries = 16;
 
-// `left`: how many of the vector's fields there are, a constant wherever it is full.
+// A row of sums: each term is a factor times a row.
+template <class T>
+struct Term {
+  int64_t row;
+  T factor;
+};
 
-template <class T, class S>
-inline void block_columns(const T* from, const T* entries, S* to, int64_t ins, int64_t count,
-                          int left, bool in_lines) {
-  typename Lane<T>::Vec sums[kEntries] = {};
-  for (int64_t k = 0; k < count; ++k) {
-    const auto x = load_one<T>(from + k * ins, left);
-#pragma GCC unroll 16
-    for (int r = 0; r < kEntries; ++r) sums[r] += entries[k * kEntries + r] * x;
+// What the matrix is other than zero: the terms of each orbit's entries, or of its coefficients.
+template <class T>
+class Terms {
+ public:
+  Terms(const T* matrix, int64_t orbits, int64_t count, bool of_entries)
+      : sums_(of_entries ? kEntries : count) {
+    for (int64_t n = 0; n < orbits; ++n) {
+      for (int64_t sum = 0; sum < sums_; ++sum) {
+        begins_.push_back(terms_.size());
+        for (int64_t row = 0; row < (of_entries ? count : kEntries); ++row) {
+          const int64_t k = of_entries ? row : sum, r = of_entries ? sum : row;
+          const T factor = matrix[(n * count + k) * kEntries + r];
+          if (factor != 0) terms_.push_back({row, factor});
+        }
+      }
+    }
+    begins_.push_back(terms_.size());
   }
-#pragma GCC unroll 16
-  for (int r = 0; r < kEntries; ++r) store_one<T>(to + r * ins, left, sums[r], in_lines);
+
+  // to[s][i] = sum of factor * from[row][i] over the terms of sum s, added to what is there if `add`.
+  void apply(int64_t orbit, const T* from, T* to, int64_t width, bool add) const {
+    for (int64_t s = 0; s < sums_; ++s) {
+      const Term<T>* begin = terms_.data() + begins_[orbit * sums_ + s];
+      const Term<T>* end = terms_.data() + begins_[orbit * sums_ + s + 1];
+      constexpr int size = Lane<T>::size;
+      int64_t i = 0;
+      for (; i + kGroup * size <= width; i += kGroup * size) {
+        columns<kGroup>(begin, end, from + i, to + s * width + i, width, size, add);
+      }
+      for (; i < width; i += size) {
+        const int count = static_cast<int>(std::min<int64_t>(width - i, size));
+        columns<1>(begin, end, from + i, to + s * width + i, width, count, add);
+      }
+    }
+  }
+
+ private:
+  template <int kVectors>
+  static inline __attribute__((always_inline)) void columns(const Term<T>* begin, const Term<T>* end, const T* from, T* to, int64_t width,
+                      int count, bool add) {
+    constexpr int size = Lane<T>::size;
+    typename Lane<T>::Vec sums[kVectors] = {};
+    if (add) {
+      for (int v = 0; v < kVectors; ++v) sums[v] = load_one<T>(to + v * size, count);
+    }
+    for (const Term<T>* term = begin; term != end; ++term) {
+      const T* row = from + term->row * width;
+#pragma GCC unroll 4
+      for (int v = 0; v < kVectors; ++v) sums[v] += term->factor * load_one<T>(row + v * size, count);
+    }
+    for (int v = 0; v < kVectors; ++v) store_one<T>(to + v * size, count, sums[v]);
+  }
+
+  int64_t sums_;
+  std::vector<Term<T>> terms_;
+  std::vector<size_t> begins_;
+};
+
+// `count` numbers between types; what is written past the caches if it begins with a line.
+template <class T, class S>
+void write_out(const T* from, S* to, int64_t count) {
+  constexpr int size = kGroup * Lane<T>::size;
+  for (int64_t i = 0; i < count; i += size) {
+    typename Lane<T>::Vec group[kGroup] = {};
+    const int some = static_cast<int>(std::min<int64_t>(count - i, size));
+    load<T>(from + i, some, group);
+    store<T>(to + i, some, group);
+  }
 }
 
 template <class T, class S>
-inline void add_gradient(const S* from, const T* weights, T* total, int64_t ins, int64_t count,
-                         int left) {
-  typename Lane<T>::Vec entries[kEntries];
-#pragma GCC unroll 16
-  for (int r = 0; r < kEntries; ++r) entries[r] = load_one<T>(from + r * ins, left);
-  for (int64_t k = 0; k < count; ++k) {
-    auto sum = load_one<T>(total + k * ins, left), other = weights[k * kEntries] * entries[0];
-#pragma GCC unroll 8
-    for (int r = 1; r < kEntries / 2; ++r) other += weights[k * kEntries + r] * entries[r];
-#pragma GCC unroll 8
-    for (int r = kEntries / 2; r < kEntries; ++r) sum += weights[k * kEntries + r] * entries[r];
-    store_one<T>(total + k * ins, left, sum + other);
+void read_in(const S* from, T* to, int64_t count) {
+  constexpr int size = Lane<T>::size;
+  for (int64_t i = 0; i < count; i += size) {
+    const int some = static_cast<int>(std::min<int64_t>(count - i, size));
+    store_one<T>(to + i, some, load_one<T>(from + i, some));
   }
 }
 
 template <class T, class S>
 void blocks_of(const T* coefficients, const T* matrix, S* blocks, int64_t orbits, int64_t outs,
                int64_t ins, int64_t count, int threads) {
-  constexpr int size = Lane<T>::size;
-  const bool in_lines = ins % size == 0 && is_line_start(blocks);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t o = 0; o < outs; ++o) {
-    const T* from = coefficients + o * count * ins;
-    for (int64_t n = 0; n < orbits; ++n) {
-      const T* entries = matrix + n * count * kEntries;
-      S* to = blocks + (n * outs + o) * kEntries * ins;
-      int64_t i = 0;
-      for (; i + size <= ins; i += size) {
-        block_columns(from + i, entries, to + i, ins, count, size, in_lines);
+  const Terms<T> terms(matrix, orbits, count, true);
+#pragma omp parallel num_threads(threads)
+  {
+    std::vector<T> block(kEntries * ins);
+#pragma omp for schedule(static)
+    for (int64_t o = 0; o < outs; ++o) {
+      for (int64_t n = 0; n < orbits; ++n) {
+        terms.apply(n, coefficients + o * count * ins, block.data(), ins, false);
+        write_out(block.data(), blocks + (n * outs + o) * kEntries * ins, kEntries * ins);
       }
-      if (i < ins) {
-        block_columns(from + i, entries, to + i, ins, count, static_cast<int>(ins - i), false);
-      }
+      finish_streams();
     }
-    finish_streams();
   }
 }
 
 template <class T, class S>
 void gradient_of(const S* blocks, const T* matrix, T* gradient, int64_t orbits, int64_t outs,
                  int64_t ins, int64_t count, int threads) {
-  constexpr int size = Lane<T>::size;
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t o = 0; o < outs; ++o) {
-    T* total = gradient + o * count * ins;
-    for (int64_t n = 0; n < orbits; ++n) {
-      const S* from = blocks + (n * outs + o) * kEntries * ins;
-      const T* weights = matrix + n * count * kEntries;
-      int64_t i = 0;
-      for (; i + size <= ins; i += size) {
-        add_gradient(from + i, weights, total + i, ins, count, size);
+  const Terms<T> terms(matrix, orbits, count, false);
+#pragma omp parallel num_threads(threads)
+  {
+    std::vector<T> block(kEntries * ins);
+#pragma omp for schedule(static)
+    for (int64_t o = 0; o < outs; ++o) {
+      for (int64_t n = 0; n < orbits; ++n) {
+        read_in(blocks + (n * outs + o) * kEntries * ins, block.data(), kEntries * ins);
+        terms.apply(n, block.data(), gradient + o * count * ins, ins, true);
       }
-      if (i < ins) add_gradient(from + i, weights, total + i, ins, count, static_cast<int>(ins - i));
     }
   }
+}
+
+template <class T>
+const T* as(const void* pointer) {
+  return static_cast<const T*>(pointer);
 }
 
 }  // namespace
@@ -98,14 +154,14 @@ extern "C" {
 void i2i_blocks(const void* coefficients, const void* matrix, void* blocks, int type,
                 int64_t orbits, int64_t outs, int64_t ins, int64_t count, int threads) {
   if (type == 0) {
-    blocks_of(static_cast<const float*>(coefficients), static_cast<const float*>(matrix),
-              static_cast<float*>(blocks), orbits, outs, ins, count, threads);
+    blocks_of(as<float>(coefficients), as<float>(matrix), static_cast<float*>(blocks), orbits,
+              outs, ins, count, threads);
   } else if (type == 1) {
-    blocks_of(static_cast<const float*>(coefficients), static_cast<const float*>(matrix),
-              static_cast<uint16_t*>(blocks), orbits, outs, ins, count, threads);
+    blocks_of(as<float>(coefficients), as<float>(matrix), static_cast<uint16_t*>(blocks), orbits,
+              outs, ins, count, threads);
   } else {
-    blocks_of(static_cast<const double*>(coefficients), static_cast<const double*>(matrix),
-              static_cast<double*>(blocks), orbits, outs, ins, count, threads);
+    blocks_of(as<double>(coefficients), as<double>(matrix), static_cast<double*>(blocks), orbits,
+              outs, ins, count, threads);
   }
 }
 
@@ -113,14 +169,14 @@ void i2i_coefficient_gradient(const void* blocks, const void* matrix, void* grad
                               int64_t orbits, int64_t outs, int64_t ins, int64_t count,
                               int threads) {
   if (type == 0) {
-    gradient_of(static_cast<const float*>(blocks), static_cast<const float*>(matrix),
-                static_cast<float*>(gradient), orbits, outs, ins, count, threads);
+    gradient_of(as<float>(blocks), as<float>(matrix), static_cast<float*>(gradient), orbits, outs,
+                ins, count, threads);
   } else if (type == 1) {
-    gradient_of(static_cast<const uint16_t*>(blocks), static_cast<const float*>(matrix),
-                static_cast<float*>(gradient), orbits, outs, ins, count, threads);
+    gradient_of(as<uint16_t>(blocks), as<float>(matrix), static_cast<float*>(gradient), orbits,
+                outs, ins, count, threads);
   } else {
-    gradient_of(static_cast<const double*>(blocks), static_cast<const double*>(matrix),
-                static_cast<double*>(gradient), orbits, outs, ins, count, threads);
+    gradient_of(as<double>(blocks), as<double>(matrix), static_cast<double*>(gradient), orbits,
+                outs, ins, count, threads);
   }
 }
 }
