@@ -21,7 +21,7 @@ from i2i.nn.c4_spectral import (
 from i2i.nn.c4_stem import _Compiled, _Unfolded
 from i2i.nn.c4_transforms import analyse, synthesise
 from i2i.nn.native.stem import StemGeometry
-from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major, turn_max
 
 needs_library = pytest.mark.skipif(
     native.library() is None, reason="no compiler was found when i2i was installed"
@@ -95,6 +95,7 @@ def test_nothing_behind_an_array_is_written(fields, batch, monkeypatch):
     native.turn_over(maps, to_pixel_major=False)
     x = maps.clone().requires_grad_()
     norm.pixel_major(x, shortcut=x, relu=True).sum().backward()
+    turn_max(maps.clone().requires_grad_()).sum().backward()
     stem = _Compiled(torch.randn(2, 1, 4 * fields, 4 * fields), StemGeometry(5, 2, 2, 3, 2, 1))
     stem.moments()
     seen, kept = stem.forward(torch.randn(fields, 26), wants_places=True)
@@ -257,6 +258,22 @@ def test_the_norm_keeps_the_digits_of_a_small_spread_about_a_large_mean():
     assert relative_error(moments[1], rows.var(dim=1, correction=0)) < 1e-5
     normal = (rows - moments[0][:, None]) / moments[1].sqrt()[:, None]
     assert relative_error(y.permute(2, 0, 1, 3).flatten(1), normal) < 1e-6
+
+
+@needs_library
+@pytest.mark.parametrize("batch", [1, 16, 37])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_gradient_of_the_largest_turn_is_that_of_torch(dtype, batch):
+    """Also where several turns are the largest, as all are behind a ReLU that clipped them."""
+    x = torch.relu(torch.randint(-3, 4, (9, 4, 5, batch)).to(dtype)).requires_grad_()
+    upstream = torch.randn(9, 5, batch, dtype=dtype)
+
+    def outcome():
+        y = turn_max(x)
+        return y, torch.autograd.grad(y, x, upstream)[0]
+
+    for ours, expected in zip(outcome(), in_torch(outcome), strict=True):
+        torch.testing.assert_close(ours, expected)
 
 
 def test_the_gradient_of_a_layout_is_the_layout_back():

@@ -77,14 +77,18 @@ def _joint_batch_norm(norm: nn.BatchNorm1d | nn.BatchNorm2d, x: Tensor) -> Tenso
 
 
 def _joint_moments(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and biased variance of each channel over all processes, float64, and the count.
+    """Mean and biased variance of each channel over all processes, float64, and the count."""
+    var, mean = torch.var_mean(at_least_float32(x), _others(x), correction=0)
+    return joint_moments(mean, var, x.numel() // x.shape[1])
+
+
+def joint_moments(mean: Tensor, var: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The moments over all processes from those of this one, (C,), float64, and the joint count.
 
     Every process tells its own two and they are put together: var = E[var_r + (mean_r − mean)²],
     which keeps the digits that E[x²] − mean² would lose.
     """
-    var, mean = torch.var_mean(at_least_float32(x), _others(x), correction=0)
-    count = mean.new_full((1,), x.numel() // x.shape[1], dtype=torch.float64)
-    ours = torch.cat([mean.double(), var.double(), count])
+    ours = torch.cat([mean.double(), var.double(), mean.new_tensor([count]).double()])
     parts = [torch.empty_like(ours) for _ in range(num_processes())]
     distributed.all_gather(parts, ours)
     together = torch.stack(parts)

@@ -9,7 +9,7 @@ from i2i.nn.c4 import C4Conv, group_max_pool, regular_type, trivial_type
 from i2i.nn.c4_dispatch import takes_product, takes_spectral
 from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_stem import stem_map
-from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
+from i2i.nn.pixel_major import from_pixel_major, to_pixel_major, turn_max
 from i2i.nn.precision import at_least_float32
 
 STEM_MODES = ("ref", "odd", "k4", "pool")
@@ -240,7 +240,7 @@ class C4ResNet18(nn.Module):
         x, is_pixel_major = self._run_blocks(self._stem_map(image))
         if not is_pixel_major:
             return group_max_pool(x)
-        x = x.amax(dim=1)  # (S · S, out_channels, B)
+        x = turn_max(x)  # (S · S, out_channels, B)
         return x.permute(2, 1, 0).reshape(len(image), -1, self.map_size, self.map_size)
 
     def _stem_map(self, image: Tensor) -> Tensor:

@@ -144,9 +144,7 @@ def _fold(kernel: Tensor, norm: C4BatchNorm, stem: "_Unfolded | _Compiled") -> T
     return torch.cat([weight, shift.repeat_interleave(TURNS)[:, None]], dim=1).to(kernel)
 
 
-def _field_moments(
-    kernel: Tensor, sums: Tensor, *, shared: bool
-) -> tuple[Tensor, Tensor, Tensor]:
+def _field_moments(kernel: Tensor, sums: Tensor, *, shared: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Mean and (biased) variance of each field's outputs, (F,), and their number, in float64.
 
     The patches' own moments are constants, so that sharing them over processes is all that the

@@ -6,7 +6,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from i2i.nn import native
 from i2i.nn.c4_spectral_constants import ORDER
@@ -23,6 +23,14 @@ def from_pixel_major(x: Tensor) -> Tensor:
     side = math.isqrt(len(x))
     moved: Tensor = _TurnOver.apply(x, False)
     return moved.unflatten(2, (side, side))
+
+
+def turn_max(x: Tensor) -> Tensor:
+    """The largest of each field's four turns: (P, 4, C, B) -> (P, C, B)."""
+    if native.is_built_for(x, x.dtype) and x.shape[1] == ORDER:
+        largest: Tensor = _TurnMax.apply(x)
+        return largest
+    return x.amax(dim=1)
 
 
 def _turn_over(x: Tensor, to_pixel_major: bool) -> Tensor:
@@ -46,3 +54,17 @@ class _TurnOver(torch.autograd.Function):
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
         back: Tensor = _TurnOver.apply(grad, not ctx.to_pixel_major)  # type: ignore[attr-defined]
         return back, None
+
+
+class _TurnMax(torch.autograd.Function):
+    """amax over turns; torch passes several times over the maps for its gradient."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.amax(dim=1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> Tensor:
+        return native.turn_max_backward(ctx.saved_tensors[0], grad)  # type: ignore[attr-defined]

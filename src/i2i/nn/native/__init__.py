@@ -45,6 +45,7 @@ def library() -> ctypes.CDLL | None:
 
 
 def functions() -> ctypes.CDLL:
+    """The library, which has to be there: ask :func:`is_built_for` first."""
     found = library()
     assert found is not None, "no library for this processor: ask is_built_for first"
     return found
@@ -157,6 +158,20 @@ def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
     return result
 
 
+def turn_max_backward(maps: Tensor, grad: Tensor) -> Tensor:
+    """Gradient of the maximum over turns: (P, 4, C, B), float32 or float64, and (P, C, B)."""
+    maps, grad = maps.contiguous(), grad.to(maps.dtype).contiguous()
+    result = torch.empty_like(maps)
+    functions().i2i_turn_max_backward(
+        *map(pointer, (maps, grad, result)),
+        int(maps.dtype == torch.float64),
+        ctypes.c_int64(len(maps)),
+        ctypes.c_int64(grad[0].numel()),
+        torch.get_num_threads(),
+    )
+    return result
+
+
 def blocks(coefficients: Tensor, matrix: Tensor, dtype: torch.dtype) -> Tensor:
     """Make the blocks, see `c4_spectral.transform_filters`; only where :func:`is_built_for`."""
     out_fields, in_fields, _ = coefficients.shape
@@ -261,6 +276,17 @@ def norm(
     return y
 
 
+def norm_moments(x: Tensor) -> Tensor:
+    """Mean and biased variance of the fields of pixel-major maps (..., F, B): (2, F), float64."""
+    x = x.contiguous()
+    moments = x.new_empty(2, x.shape[-2], dtype=torch.float64)
+    nothing = (None, None, None)
+    functions().i2i_norm(
+        *map(pointer, (x, *nothing, *moments, None)), ctypes.c_double(0), 0, 1, *_rows(x)
+    )
+    return moments
+
+
 def norm_backward(
     grad: Tensor,
     clipped: Tensor | None,
@@ -269,26 +295,43 @@ def norm_backward(
     moments: Tensor,
     *,
     eps: float,
-    has_shortcut: bool,
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Gradients of :func:`norm` with fresh moments: of x, shortcut, weight and bias (float64).
+    wants: tuple[bool, bool],
+    given: tuple[Tensor, float] | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor]:
+    """Gradient of :func:`norm` of the batch's own moments.
 
-    ``clipped`` is what :func:`norm` gave, where it clipped.
+    Args:
+        grad: Upstream, (..., F, B).
+        clipped: What :func:`norm` gave, where it clipped.
+        x: What it was given.
+        weight: (F,).
+        moments: Those of the batch, (2, F).
+        eps: Added to the variance.
+        wants: Whether the gradients of x and of the shortcut are wanted.
+        given: The sums below and how many numbers of a field they are of, where processes share
+            a batch; otherwise they are taken here.
+
+    Returns:
+        The gradients, and the sums over each field of the gradient before the clipping and of
+        its product with x - mean, (2, F), float64: the gradient of the bias, and of the weight
+        times the standard deviation.
     """
-    grad, weight = grad.contiguous(), weight.contiguous()
-    of_x = torch.empty_like(x)
-    of_shortcut = torch.empty_like(x) if has_shortcut else None
-    of_weight, of_bias = torch.empty_like(moments[0]), torch.empty_like(moments[0])
+    fields = x.shape[-2]
+    sums, count = given or (moments.new_empty(2, fields), x.numel() / fields)
+    of_x, of_shortcut = (torch.empty_like(x) if wanted else None for wanted in wants)
+    arrays = (grad.contiguous(), clipped, x, weight.contiguous(), *moments, sums)
     functions().i2i_norm_backward(
-        *map(pointer, (grad, clipped, x, weight, *moments)),
-        *map(pointer, (of_x, of_shortcut, of_weight, of_bias)),
+        *map(pointer, (*arrays, of_x, of_shortcut)),
         ctypes.c_double(eps),
+        ctypes.c_double(count),
+        int(given is None),
         *_rows(x),
     )
-    return of_x, of_shortcut, of_weight, of_bias
+    return of_x, of_shortcut, sums
 
 
 def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    """Of a tensor's first number, for a call of the library; None gives the null pointer."""
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
 
 

@@ -1,12 +1,14 @@
 // Batch norm of pixel-major maps, the sum with a shortcut and the clipping after it, and their
-// gradients: the rows of one field are read once from memory, and again from the cache.
+// gradients. The rows of one field are read once and kept side by side: where they are, they lie
+// multiples of 4 KiB apart with 64 images, and would drive each other out of the caches.
 //
 //   y = relu(scale (x - mean) + bias + shortcut),  scale = weight / sqrt(var + eps)
 //
-// Moments are summed in double precision, row by row.
+// Moments are summed in double precision.
 
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include "lanes.h"
 
@@ -14,14 +16,35 @@ namespace {
 
 using namespace i2i;
 
-// Maps (rows, fields, batch): where the images of a row and field begin.
+constexpr int kTogether = 4;  // fields whose rows are read side by side
+
+// Maps (rows, fields, batch), seen by a few fields at a time.
 struct Rows {
   int64_t rows, fields, batch;
-  int64_t at(int64_t row, int64_t field) const { return (row * fields + field) * batch; }
-  int left(int64_t image, int size) const {
-    return batch - image < size ? static_cast<int>(batch - image) : size;
-  }
   double count() const { return static_cast<double>(rows) * batch; }
+  int together(int64_t field) const {
+    return fields - field < kTogether ? static_cast<int>(fields - field) : kTogether;
+  }
+
+  // Calls act(field - first, where a vector begins, its number, how much of it counts).
+  template <class T, class Act>
+  inline void each_vector(int64_t first, const Act& act) const {
+    constexpr int size = Lane<T>::size;
+    const int some = together(first);
+    int64_t number = 0;
+    for (int64_t row = 0; row < rows; ++row) {
+      for (int f = 0; f < some; ++f) {
+        const int64_t start = (row * fields + first + f) * batch;
+        for (int64_t image = 0; image < batch; image += size) {
+          const int64_t left = batch - image;
+          act(f, start + image, number++, left < size ? static_cast<int>(left) : size);
+        }
+      }
+    }
+  }
+
+  // Numbers that the vectors of a few fields hold, with what fills up the last of each row.
+  int64_t kept(int size) const { return kTogether * rows * ((batch + size - 1) / size * size); }
 };
 
 // As many numbers in double precision.
@@ -36,27 +59,25 @@ struct Widened<double> {
   typedef double Vec __attribute__((vector_size(kLineBytes)));
 };
 
-// Sums over rows and images of two functions of where a vector begins and how much of it counts;
-// what they add past the end has to be zero.
-template <class T, class Terms>
-inline void add_up(const Rows& shape, int64_t field, const Terms& terms, double (&sums)[2]) {
-  constexpr int size = Lane<T>::size;
+// Two sums of vectors for each field, in double precision.
+template <class T>
+class Sums {
+ public:
   typedef typename Widened<T>::Vec Wide;
-  Wide totals[2] = {};
-  for (int64_t row = 0; row < shape.rows; ++row) {
-    typename Lane<T>::Vec first = {}, second = {};
-    const int64_t at = shape.at(row, field);
-    for (int64_t image = 0; image < shape.batch; image += size) {
-      terms(at + image, shape.left(image, size), first, second);
-    }
-    totals[0] += __builtin_convertvector(first, Wide);
-    totals[1] += __builtin_convertvector(second, Wide);
+
+  void add(int field, typename Lane<T>::Vec first, typename Lane<T>::Vec second) {
+    totals_[field][0] += __builtin_convertvector(first, Wide);
+    totals_[field][1] += __builtin_convertvector(second, Wide);
   }
-  for (int part = 0; part < 2; ++part) {
-    sums[part] = 0;
-    for (int i = 0; i < size; ++i) sums[part] += totals[part][i];
+  double operator()(int field, int which) const {
+    double sum = 0;
+    for (int i = 0; i < Lane<T>::size; ++i) sum += totals_[field][which][i];
+    return sum;
   }
-}
+
+ private:
+  Wide totals_[kTogether][2] = {};
+};
 
 template <class T>
 inline typename Lane<T>::Vec keep(typename Lane<T>::Vec v, int count) {
@@ -64,6 +85,36 @@ inline typename Lane<T>::Vec keep(typename Lane<T>::Vec v, int count) {
   return v;
 }
 
+// Mean and variance of some fields, whose vectors are written to `kept`.
+template <class T>
+void moments_of(const T* x, T* kept, const Rows& shape, int64_t first, double* mean,
+                double* variance) {
+  typedef typename Lane<T>::Vec Vec;
+  constexpr int size = Lane<T>::size;
+  const int some = shape.together(first);
+  Sums<T> sums, rest;
+  shape.each_vector<T>(first, [&](int f, int64_t at, int64_t number, int count) {
+    const Vec value = load_one<T>(x + at, count);
+    store_one<T>(kept + number * size, size, value);
+    sums.add(f, value, Vec{});
+  });
+  T middle[kTogether];
+  for (int f = 0; f < some; ++f) {
+    mean[first + f] = sums(f, 0) / shape.count();
+    middle[f] = static_cast<T>(mean[first + f]);
+  }
+  shape.each_vector<T>(first, [&](int f, int64_t, int64_t number, int count) {
+    Vec centred = load_one<T>(kept + number * size, size) - middle[f];
+    if (count < size) centred = keep<T>(centred, count);
+    rest.add(f, centred, centred * centred);  // the first is what rounding the mean has left
+  });
+  for (int f = 0; f < some; ++f) {
+    const double error = rest(f, 0) / shape.count();
+    variance[first + f] = rest(f, 1) / shape.count() - error * error;
+  }
+}
+
+// `y` may be null: then only the moments are wanted.
 template <class T>
 void forward(const T* x, const T* shortcut, const T* weight, const T* bias, double* mean,
              double* variance, T* y, double epsilon, bool relu, bool of_batch, const Rows& shape,
@@ -71,88 +122,111 @@ void forward(const T* x, const T* shortcut, const T* weight, const T* bias, doub
   typedef typename Lane<T>::Vec Vec;
   constexpr int size = Lane<T>::size;
   const bool in_lines = shape.batch % size == 0 && is_line_start(y);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t field = 0; field < shape.fields; ++field) {
-    if (of_batch) {
-      double sums[2];
-      add_up<T>(shape, field, [&](int64_t at, int count, Vec& first, Vec&) {
-        first += load_one<T>(x + at, count);
-      }, sums);
-      mean[field] = sums[0] / shape.count();
-      const T middle = static_cast<T>(mean[field]);
-      add_up<T>(shape, field, [&](int64_t at, int count, Vec& first, Vec& second) {
-        Vec centred = load_one<T>(x + at, count) - middle;
-        if (count < size) centred = keep<T>(centred, count);
-        first += centred;  // what rounding the mean has left
-        second += centred * centred;
-      }, sums);
-      const double rest = sums[0] / shape.count();
-      variance[field] = sums[1] / shape.count() - rest * rest;
-    }
-    const double factor = weight[field] / std::sqrt(variance[field] + epsilon);
-    const T scale = static_cast<T>(factor), middle = static_cast<T>(mean[field]);
-    const T shift = static_cast<T>(bias[field] + (middle - mean[field]) * factor);
-    for (int64_t row = 0; row < shape.rows; ++row) {
-      const int64_t start = shape.at(row, field);
-      for (int64_t image = 0; image < shape.batch; image += size) {
-        const int64_t at = start + image;
-        const int count = shape.left(image, size);
-        Vec value = scale * (load_one<T>(x + at, count) - middle) + shift;
+#pragma omp parallel num_threads(threads)
+  {
+    std::vector<T> memory(of_batch ? shape.kept(size) : 0);
+#pragma omp for schedule(static)
+    for (int64_t first = 0; first < shape.fields; first += kTogether) {
+      if (of_batch) moments_of(x, memory.data(), shape, first, mean, variance);
+      if (!y) continue;
+      T scale[kTogether], middle[kTogether], shift[kTogether];
+      for (int f = 0; f < shape.together(first); ++f) {
+        const double factor = weight[first + f] / std::sqrt(variance[first + f] + epsilon);
+        scale[f] = static_cast<T>(factor), middle[f] = static_cast<T>(mean[first + f]);
+        shift[f] = static_cast<T>(bias[first + f] + (middle[f] - mean[first + f]) * factor);
+      }
+      shape.each_vector<T>(first, [&](int f, int64_t at, int64_t number, int count) {
+        Vec value = of_batch ? load_one<T>(memory.data() + number * size, size)
+                             : load_one<T>(x + at, count);
+        value = scale[f] * (value - middle[f]) + shift[f];
         if (shortcut) value += load_one<T>(shortcut + at, count);
         if (relu) value = value < 0 ? Vec{} : value;  // keeps what is not a number
         store_one<T>(y + at, count, value, in_lines);
-      }
+      });
+      finish_streams();
     }
-    finish_streams();
   }
 }
 
+// Of the batch norm's gradient: what is read, where it is written, and over how many numbers of a
+// field the moments were taken (in all processes).
 template <class T>
-void backward(const T* grad, const T* y, const T* x, const T* weight, const double* mean,
-              const double* variance, T* of_x, T* of_shortcut, double* of_weight, double* of_bias,
-              double epsilon, const Rows& shape, int threads) {
-  typedef typename Lane<T>::Vec Vec;
-  constexpr int size = Lane<T>::size;
-  const bool in_lines = shape.batch % size == 0 && is_line_start(of_x) &&
-                        (!of_shortcut || is_line_start(of_shortcut));
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t field = 0; field < shape.fields; ++field) {
-    const auto upstream = [&](int64_t at, int count) {
-      const Vec g = load_one<T>(grad + at, count);
-      return y ? (load_one<T>(y + at, count) <= 0 ? Vec{} : g) : g;  // past the end both are zero
-    };
-    const double inverse = 1 / std::sqrt(variance[field] + epsilon);
-    const T middle = static_cast<T>(mean[field]);
-    double sums[2];
-    add_up<T>(shape, field, [&](int64_t at, int count, Vec& first, Vec& second) {
-      const Vec g = upstream(at, count);
-      first += g;
-      second += g * (load_one<T>(x + at, count) - middle);  // past the end g is zero
-    }, sums);
-    of_bias[field] = sums[0];
-    of_weight[field] = sums[1] * inverse;
-    const double factor = weight[field] * inverse;
-    const T scale = static_cast<T>(factor);
-    const T slope = static_cast<T>(-factor * inverse * inverse * sums[1] / shape.count());
-    const T shift = static_cast<T>(-factor * sums[0] / shape.count());
-    for (int64_t row = 0; row < shape.rows; ++row) {
-      const int64_t start = shape.at(row, field);
-      for (int64_t image = 0; image < shape.batch; image += size) {
-        const int64_t at = start + image;
-        const int count = shape.left(image, size);
-        const Vec g = upstream(at, count);
-        const Vec centred = load_one<T>(x + at, count) - middle;
-        store_one<T>(of_x + at, count, scale * g + slope * centred + shift, in_lines);
-        if (of_shortcut) store_one<T>(of_shortcut + at, count, g, in_lines);
-      }
+struct Backward {
+  const T *grad, *y, *x, *weight;
+  const double *mean, *variance;
+  double* sums;  // (2, fields): of the gradient, and of its product with the centred maps
+  T *of_x, *of_shortcut;
+  double epsilon, count;
+  Rows shape;
+
+  // The gradient before the clipping; past the end it is zero.
+  typename Lane<T>::Vec upstream(int64_t at, int some) const {
+    const auto g = load_one<T>(grad + at, some);
+    return y ? (load_one<T>(y + at, some) <= 0 ? typename Lane<T>::Vec{} : g) : g;
+  }
+
+  // Sums of some fields, whose vectors (upstream, centred) are written to `kept`.
+  void add_up(int64_t first, const T* middle, T* kept) const {
+    constexpr int size = Lane<T>::size;
+    Sums<T> of_fields;
+    shape.each_vector<T>(first, [&](int f, int64_t at, int64_t number, int some) {
+      const auto g = upstream(at, some), centred = load_one<T>(x + at, some) - middle[f];
+      store_one<T>(kept + 2 * number * size, size, g);
+      store_one<T>(kept + (2 * number + 1) * size, size, centred);
+      of_fields.add(f, g, g * centred);
+    });
+    for (int f = 0; f < shape.together(first); ++f) {
+      for (int which : {0, 1}) sums[which * shape.fields + first + f] = of_fields(f, which);
     }
+  }
+
+  // Gradients of some fields from their sums; `kept` may be null.
+  void apply(int64_t first, const T* middle, const T* kept) const {
+    constexpr int size = Lane<T>::size;
+    const bool in_lines = shape.batch % size == 0 && is_line_start(of_x) &&
+                          (!of_shortcut || is_line_start(of_shortcut));
+    T scale[kTogether], slope[kTogether], shift[kTogether];
+    for (int f = 0; f < shape.together(first); ++f) {
+      const double inverse = 1 / std::sqrt(variance[first + f] + epsilon);
+      const double factor = weight[first + f] * inverse / count;
+      scale[f] = static_cast<T>(weight[first + f] * inverse);
+      slope[f] = static_cast<T>(-factor * inverse * inverse * sums[shape.fields + first + f]);
+      shift[f] = static_cast<T>(-factor * sums[first + f]);
+    }
+    shape.each_vector<T>(first, [&](int f, int64_t at, int64_t number, int some) {
+      const auto g = kept ? load_one<T>(kept + 2 * number * size, size) : upstream(at, some);
+      const auto centred = kept ? load_one<T>(kept + (2 * number + 1) * size, size)
+                                : load_one<T>(x + at, some) - middle[f];
+      store_one<T>(of_x + at, some, scale[f] * g + slope[f] * centred + shift[f], in_lines);
+      if (of_shortcut) store_one<T>(of_shortcut + at, some, g, in_lines);
+    });
     finish_streams();
   }
-}
+
+  // Without `sum` the sums are given, without `of_x` only they are wanted.
+  void run(bool sum, int threads) const {
+#pragma omp parallel num_threads(threads)
+    {
+      std::vector<T> memory(sum ? 2 * shape.kept(Lane<T>::size) : 0);
+#pragma omp for schedule(static)
+      for (int64_t first = 0; first < shape.fields; first += kTogether) {
+        T middle[kTogether];
+        for (int f = 0; f < shape.together(first); ++f) middle[f] = static_cast<T>(mean[first + f]);
+        if (sum) add_up(first, middle, memory.data());
+        if (of_x) apply(first, middle, sum ? memory.data() : nullptr);
+      }
+    }
+  }
+};
 
 template <class T>
 const T* as(const void* pointer) {
   return static_cast<const T*>(pointer);
+}
+
+template <class T>
+T* as(void* pointer) {
+  return static_cast<T*>(pointer);
 }
 
 }  // namespace
@@ -165,26 +239,28 @@ void i2i_norm(const void* x, const void* shortcut, const void* weight, const voi
   const Rows shape{rows, fields, batch};
   if (is_double) {
     forward(as<double>(x), as<double>(shortcut), as<double>(weight), as<double>(bias), mean,
-            variance, static_cast<double*>(y), epsilon, relu != 0, of_batch != 0, shape, threads);
+            variance, as<double>(y), epsilon, relu != 0, of_batch != 0, shape, threads);
   } else {
     forward(as<float>(x), as<float>(shortcut), as<float>(weight), as<float>(bias), mean, variance,
-            static_cast<float*>(y), epsilon, relu != 0, of_batch != 0, shape, threads);
+            as<float>(y), epsilon, relu != 0, of_batch != 0, shape, threads);
   }
 }
 
 void i2i_norm_backward(const void* grad, const void* y, const void* x, const void* weight,
-                       const double* mean, const double* variance, void* of_x, void* of_shortcut,
-                       double* of_weight, double* of_bias, double epsilon, int is_double,
+                       const double* mean, const double* variance, double* sums, void* of_x,
+                       void* of_shortcut, double epsilon, double count, int sum, int is_double,
                        int64_t rows, int64_t fields, int64_t batch, int threads) {
   const Rows shape{rows, fields, batch};
   if (is_double) {
-    backward(as<double>(grad), as<double>(y), as<double>(x), as<double>(weight), mean, variance,
-             static_cast<double*>(of_x), static_cast<double*>(of_shortcut), of_weight, of_bias,
-             epsilon, shape, threads);
+    const Backward<double> backward{as<double>(grad), as<double>(y), as<double>(x),
+                                    as<double>(weight), mean, variance, sums, as<double>(of_x),
+                                    as<double>(of_shortcut), epsilon, count, shape};
+    backward.run(sum != 0, threads);
   } else {
-    backward(as<float>(grad), as<float>(y), as<float>(x), as<float>(weight), mean, variance,
-             static_cast<float*>(of_x), static_cast<float*>(of_shortcut), of_weight, of_bias,
-             epsilon, shape, threads);
+    const Backward<float> backward{as<float>(grad), as<float>(y), as<float>(x), as<float>(weight),
+                                   mean, variance, sums, as<float>(of_x), as<float>(of_shortcut),
+                                   epsilon, count, shape};
+    backward.run(sum != 0, threads);
   }
 }
 }

@@ -1,4 +1,5 @@
-// Maps (B, C * 4, P), whose cells lie side by side, to (P, 4, C, B), whose images do, and back.
+// Maps (B, C * 4, P), whose cells lie side by side, to (P, 4, C, B), whose images do, and back; and
+// the gradient of the maximum over the four turns of the latter.
 
 #include <cstdint>
 
@@ -52,6 +53,33 @@ void turn_over(const T* from, T* to, bool to_pixel_major, int64_t rows, int64_t 
   }
 }
 
+// Where several turns are the largest each gets an equal share, as of torch's amax.
+template <class T>
+void turn_max_backward(const T* maps, const T* grad, T* result, int64_t pixels, int64_t size,
+                       int threads) {
+  typedef typename Lane<T>::Vec Vec;
+  const bool in_lines = size % Lane<T>::size == 0 && is_line_start(result);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t pixel = 0; pixel < pixels; ++pixel) {
+    for (int64_t i = 0; i < size; i += Lane<T>::size) {
+      const int count = static_cast<int>(size - i < Lane<T>::size ? size - i : Lane<T>::size);
+      Vec turns[kTurns];
+      for (int g = 0; g < kTurns; ++g) {
+        turns[g] = load_one<T>(maps + (pixel * kTurns + g) * size + i, count);
+      }
+      Vec best = turns[0], times = {};
+      for (int g = 1; g < kTurns; ++g) best = turns[g] > best ? turns[g] : best;
+      for (int g = 0; g < kTurns; ++g) times += turns[g] == best ? Vec{} + 1 : Vec{};
+      const Vec share = load_one<T>(grad + pixel * size + i, count) / times;
+      for (int g = 0; g < kTurns; ++g) {
+        store_one<T>(result + (pixel * kTurns + g) * size + i, count,
+                     turns[g] == best ? share : Vec{}, in_lines);
+      }
+    }
+    finish_streams();
+  }
+}
+
 }  // namespace
 
 // `rows` of the source's first dimension, `columns` of its last.
@@ -64,5 +92,17 @@ extern "C" void i2i_turn_over(const void* from, void* to, int to_pixel_major, in
   } else {
     turn_over(static_cast<const float*>(from), static_cast<float*>(to), forward, rows, fields,
               columns, threads);
+  }
+}
+
+// Maps (pixels, 4, size), the gradient of their maximum (pixels, size).
+extern "C" void i2i_turn_max_backward(const void* maps, const void* grad, void* result, int is_double,
+                                      int64_t pixels, int64_t size, int threads) {
+  if (is_double) {
+    turn_max_backward(static_cast<const double*>(maps), static_cast<const double*>(grad),
+                      static_cast<double*>(result), pixels, size, threads);
+  } else {
+    turn_max_backward(static_cast<const float*>(maps), static_cast<const float*>(grad),
+                      static_cast<float*>(result), pixels, size, threads);
   }
 }
