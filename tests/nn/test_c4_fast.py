@@ -1,6 +1,7 @@
 """The fast forms of the C4 network against the dense one, layer by layer and whole."""
 
 import copy
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -83,6 +84,38 @@ def test_kept_blocks_follow_weights_mode_and_dtype():
     with torch.enable_grad():
         layer.pixel_major(x.double())
     assert layer._cache is None
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("in_kind", "size", "stride", "bias"),
+    [(regular_type, 4, 1, True), (regular_type, 3, 2, False), (trivial_type, 3, 1, False)],
+)
+def test_one_image_is_convolved_as_a_product(in_kind, size, stride, bias, monkeypatch):
+    """The kernel is kept in the type of the products; several images go to torch's convolution."""
+    monkeypatch.setattr("i2i.nn.c4_dispatch._LEAST_TAPS", 9)
+    layer = C4Conv(
+        in_kind(3), regular_type(5), size, stride=stride, padding=1, bias=bias
+    ).eval()  # fmt: skip
+    if bias:
+        nn.init.normal_(layer.bias)
+    image = torch.randn(1, layer.in_type.size, 11, 8)
+    with convolution_mode("dense"):
+        expected = layer(image)
+    conv2d = Mock(side_effect=nn.functional.conv2d)
+    monkeypatch.setattr(nn.functional, "conv2d", conv2d)
+    assert relative_error(layer(image), expected) < 1e-6
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = layer(image)
+    assert rounded.dtype == torch.bfloat16
+    assert 1e-4 < relative_error(rounded.float(), expected) < 2e-2
+    assert {dtype for _, dtype in layer._cache[1]} == {torch.float32, torch.bfloat16}
+    for parameter in layer.parameters():
+        parameter.data.mul_(2.0)  # no version counter sees this
+    assert relative_error(layer(image), 2 * expected) < 1e-6
+    assert not conv2d.called
+    layer(image.repeat(2, 1, 1, 1))
+    assert conv2d.call_count == 1
 
 
 def networks(stem_mode, dtype, **options):

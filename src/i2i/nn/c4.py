@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from i2i.nn.c4_basis import TURNS, full_basis, symmetrise
+from i2i.nn.c4_dispatch import takes_patches
 from i2i.nn.c4_spectral import (
     product_dtype,
     spectral_conv_pixel_major,
@@ -188,8 +189,9 @@ class C4Conv(R2Conv):
         return kernel, (self.bias[:, None] * self.bias_scale).flatten()
 
     def _kernel(self) -> Tensor:
-        """The expanded kernel, from the cache where that is safe."""
-        return self._cached("dense", lambda: self.expand_parameters()[0])
+        """The expanded kernel in the type of the products, from the cache where that is safe."""
+        dtype = product_dtype(self.weights)
+        return self._cached(("dense", dtype), lambda: self.expand_parameters()[0].to(dtype))
 
     def _cached(self, key: object, make: Callable[[], Tensor]) -> Tensor:
         """What `make` computes from the weights, kept in evaluation for as long as they last."""
@@ -273,7 +275,16 @@ class C4Conv(R2Conv):
                 f"expected (B, {self.in_type.size}, H, W) for {self.in_fields} fields, "
                 f"got {tuple(input.shape)}"
             )
-        out = nn.functional.conv2d(input, self._kernel(), stride=self.stride, padding=self.padding)
+        kernel, where = self._kernel(), {"stride": self.stride, "padding": self.padding}
+        if takes_patches(input, kernel):
+            # A library's convolution rearranges the kernel at every call: with one image that is
+            # most of its time.
+            size = [(side + 2 * self.padding - self.kernel_size) // self.stride + 1
+                    for side in input.shape[2:]]  # fmt: skip
+            patches = nn.functional.unfold(input.to(kernel.dtype), self.kernel_size, **where)
+            out = (kernel.flatten(1) @ patches[0]).view(1, -1, *size)
+        else:
+            out = nn.functional.conv2d(input, kernel, **where)
         if self.bias is None:
             return out
         bias = (self.bias[:, None] * self.bias_scale).flatten()

@@ -7,6 +7,7 @@ one, for comparisons and for tools that look at the layers from outside.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import torch
 from torch import Tensor
 
 from i2i.nn.c4_spectral import is_supported, product_dtype
@@ -21,6 +22,7 @@ _MODE = ["auto"]
 _LEAST_BATCH_TRAINING = (16, 8)
 _LEAST_BATCH_CACHED = (8, 2)
 _LEAST_FIELDS = 16
+_LEAST_TAPS = 2048  # of one output channel, for one image's convolution to be a product
 _LARGEST_MAP = 9  # 16 × 16 maps gain little, and lose in bfloat16, unless transforms are compiled
 
 
@@ -74,6 +76,23 @@ def takes_spectral(x: Tensor, *, fields: int, map_size: int, training: bool) -> 
         and (map_size <= _LARGEST_MAP or compiled)
         and fields >= _LEAST_FIELDS
         and len(x) >= least[compiled]
+    )
+
+
+def takes_patches(x: Tensor, kernel: Tensor) -> bool:
+    """Whether a dense convolution of x (B, C, H, W) is a product of its patches and the kernel.
+
+    Args:
+        x: Maps; one image only, without a gradient.
+        kernel: (O, C, k, k), in the type of the product.
+    """
+    return (
+        _MODE[0] == "auto"
+        and len(x) == 1
+        and x.device.type == "cpu"
+        and kernel[0].numel() >= _LEAST_TAPS
+        and not torch.is_grad_enabled()
+        and not is_traced()
     )
 
 
