@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -106,26 +107,28 @@ def _modality_warnings(info: DataInfo) -> tuple[str, ...]:
     )
 
 
-def ahead(
-    make: Callable[[_Item], _Made], items: Iterable[_Item], *, workers: int, count: int
-) -> Iterator[Future[_Made]]:
-    """What a function makes of items, in their order, made in threads before it is asked for.
+def in_batches(
+    make: Callable[[_Item], _Made], items: Iterable[_Item], *, workers: int, size: int, lead: int
+) -> Iterator[list[Future[_Made]]]:
+    """What a function makes of items, in their order, made in threads.
 
     Args:
         make: Called with each item.
-        items: Taken one by one, no more than `count` ahead of what was handed out.
+        items: Taken a batch at a time.
         workers: Threads.
-        count: How many are made, or being made, and not yet handed out, at most.
+        size: Items of a batch.
+        lead: Batches that are being made while one is handed out.
 
     Yields:
         Futures that are done: `result()` gives what was made, or raises what `make` raised.
     """
     pool = ThreadPoolExecutor(workers)
-    waiting: deque[Future[_Made]] = deque()
+    waiting: deque[list[Future[_Made]]] = deque()
+    rest = iter(items)
     try:
-        for item in items:
-            waiting.append(pool.submit(make, item))
-            if len(waiting) > count:
+        while some := list(islice(rest, size)):
+            waiting.append([pool.submit(make, item) for item in some])
+            if len(waiting) > lead:
                 yield _done(waiting.popleft())
         while waiting:
             yield _done(waiting.popleft())
@@ -133,6 +136,6 @@ def ahead(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _done(future: Future[_Made]) -> Future[_Made]:
-    future.exception()  # waits
-    return future
+def _done(batch: list[Future[_Made]]) -> list[Future[_Made]]:
+    wait(batch)
+    return batch

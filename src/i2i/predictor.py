@@ -7,26 +7,24 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from i2i.data.info import DataInfo
 from i2i.data.pictures import Picture
 from i2i.data.point_files import Cloud
+from i2i.distinct_answers import distinct_answers
 from i2i.errors import CheckpointError, ConfigurationError
 from i2i.geometry.rotations import euler_deg_from_rotation, quaternion_xyzw_from_rotation
-from i2i.geometry.symmetries import symmetric_angle_rad
 from i2i.models.prediction import PosePrediction
-from i2i.network_input import Seen, ahead, see
+from i2i.network_input import Seen, in_batches, see
 from i2i.nn.folding import fold
 from i2i.prediction_results import Alternative, ClassResult, Drawing, PoseResult
 from i2i.rendering.mesh import RenderMesh
 from i2i.rendering.reference import load_mesh
 from i2i.runs.loading import load_task, locate, move_to
 from i2i.viz.inputs import input_pictures
-
-SAME_ANSWER_DEG = 15.0
-"""Candidates closer than this to a better one count as the same answer; their mass is added up."""
 
 _NUM_ALTERNATIVES = 3
 
@@ -142,11 +140,11 @@ class Predictor:
         images: Iterable[Picture | Cloud],
         *,
         class_name: str | None = None,
-        batch_size: int = 16,
+        batch_size: int = 64,
         workers: int = 2,
         **how: Any,  # noqa: ANN401 - passed on as they are
     ) -> Iterator[PoseResult | ClassResult]:
-        """Answer for many pictures or clouds, in their order, while the next ones are read.
+        """Answer for many pictures or clouds, in their order, a batch at a time.
 
         No more than two batches are held at a time, so `images` may be a generator.
 
@@ -172,19 +170,17 @@ class Predictor:
             )
         if class_name is not None:
             self._check_class(class_name)
-        seen: list[Seen] = []
         prepare = partial(see, info=self.info, **how)
-        # One batch is read while the network is busy with another.
-        prepared = ahead(prepare, images, workers=workers, count=batch_size)
-        for future in prepared:
-            if future.exception() is not None:
-                yield from self._answer(seen, class_name)
-                seen = []
-            seen.append(future.result())
-            if len(seen) == batch_size:
-                yield from self._answer(seen, class_name)
-                seen = []
-        yield from self._answer(seen, class_name)
+        # One batch is read while a GPU is busy with another. A CPU has to do both: threads that
+        # read would only hold up those that compute.
+        lead = 0 if self.device.type == "cpu" else 1
+        for batch in in_batches(prepare, images, workers=workers, size=batch_size, lead=lead):
+            seen: list[Seen] = []
+            for future in batch:
+                if future.exception() is not None:
+                    yield from self._answer(seen, class_name)
+                seen.append(future.result())
+            yield from self._answer(seen, class_name)
 
     def _answer(
         self, seen: list[Seen], class_name: str | None
@@ -210,8 +206,7 @@ class Predictor:
                 "This network was trained for several classes and looks at each with its own "
                 f"weights: add class_name=, one of {', '.join(names)}."
             )
-        for row, one in enumerate(seen):
-            yield self._pose_result(_row(prediction, row), one, class_name=chosen)
+        yield from self._pose_results(prediction, seen, class_name=chosen)
 
     def _check_class(self, class_name: str) -> None:
         if class_name not in self.info.class_names:
@@ -220,30 +215,36 @@ class Predictor:
                 f"{', '.join(self.info.class_names)}."
             )
 
-    def _pose_result(
-        self, prediction: PosePrediction, seen: Seen, *, class_name: str
-    ) -> PoseResult:
+    def _pose_results(
+        self, prediction: PosePrediction, seen: list[Seen], *, class_name: str
+    ) -> Iterator[PoseResult]:
+        """The answers of one batch; what they have in common to compute is computed together."""
         symmetry = self.info.symmetry[self.info.class_names.index(class_name)]
-        best = prediction.rotation[0].double().cpu()
-        _check_finite(best)
-        answers = _distinct_answers(prediction, best, symmetry=symmetry)
-        turn = torch.from_numpy(seen.camera_from_crop)
-        rotation = turn @ best
-        return PoseResult(
-            class_name=class_name,
-            symmetry=symmetry,
-            rotation=rotation.numpy(),
-            quaternion_xyzw=quaternion_xyzw_from_rotation(rotation).numpy(),
-            euler_deg=euler_deg_from_rotation(rotation).numpy(),
-            confidence=answers[0][1] if answers else None,
-            alternatives=tuple(
-                Alternative(rotation=(turn @ other).numpy(), probability=probability)
-                for other, probability in answers[1 : 1 + _NUM_ALTERNATIVES]
-            ),
-            warnings=seen.warnings,
-            crop_box=seen.crop_box,
-            drawing=self._drawing(seen, self.reference_meshes.get(class_name)),
-        )
+        best = prediction.rotation.double().cpu()
+        turns = torch.from_numpy(np.stack([one.camera_from_crop for one in seen]))
+        answers = distinct_answers(prediction, symmetry, count=1 + _NUM_ALTERNATIVES)
+        is_finite = best.isfinite().all(dim=(1, 2), keepdim=True)
+        rotations = turns @ torch.where(is_finite, best, torch.eye(3, dtype=torch.float64))
+        quaternions = quaternion_xyzw_from_rotation(rotations)
+        euler_deg = euler_deg_from_rotation(rotations)
+        mesh = self.reference_meshes.get(class_name)
+        for row, one in enumerate(seen):
+            _check_finite(best[row])
+            yield PoseResult(
+                class_name=class_name,
+                symmetry=symmetry,
+                rotation=rotations[row].numpy(),
+                quaternion_xyzw=quaternions[row].numpy(),
+                euler_deg=euler_deg[row].numpy(),
+                confidence=answers[row][0][1] if answers[row] else None,
+                alternatives=tuple(
+                    Alternative(rotation=(turns[row] @ other).numpy(), probability=probability)
+                    for other, probability in answers[row][1:]
+                ),
+                warnings=one.warnings,
+                crop_box=one.crop_box,
+                drawing=self._drawing(one, mesh),
+            )
 
     def _class_result(self, logits: Tensor, seen: Seen) -> ClassResult:
         """The answer for one picture from its logits (C,)."""
@@ -298,55 +299,9 @@ def load(
     )
 
 
-def _row(prediction: PosePrediction, row: int) -> PosePrediction:
-    """What a prediction says about one picture of its batch."""
-    one, candidates, log_prob = slice(row, row + 1), prediction.candidates, prediction.log_prob
-    if candidates is not None and candidates.ndim == 4:  # else all pictures share them
-        candidates = candidates[one]
-    return PosePrediction(
-        rotation=prediction.rotation[one],
-        log_prob=None if log_prob is None else log_prob[one],
-        candidates=candidates,
-    )
-
-
 def _check_finite(values: Tensor) -> None:
     if not torch.isfinite(values).all():
         raise CheckpointError(
             "The network's answer is not a finite number: its weights are damaged or training "
             "diverged. Use another checkpoint (ckpt=best), or train again with a lower lr."
         )
-
-
-def _distinct_answers(
-    prediction: PosePrediction, best: Tensor, *, symmetry: str
-) -> list[tuple[Tensor, float]]:
-    """Different answers and their probability masses, the given best one first.
-
-    Several candidates may stand for one rotation (neighbouring group elements whose residuals
-    meet): each candidate's mass goes to the first answer within `SAME_ANSWER_DEG` of it, going
-    through the candidates from the most probable to the least. Answers that look the same by the
-    symmetry of the class are one.
-
-    Returns:
-        Empty for a network without a distribution.
-    """
-    if prediction.log_prob is None or prediction.candidates is None:
-        return []
-    candidates = prediction.candidates.double().cpu()
-    candidates = candidates if candidates.ndim == 3 else candidates[0]  # (K, 3, 3)
-    mass = prediction.log_prob[0].double().exp().cpu()
-    answers, free = [], torch.ones(len(mass), dtype=torch.bool)
-    order = torch.argsort(mass, descending=True, stable=True).tolist()
-    centers = [best, *(candidates[index] for index in order)]
-    for number, center in enumerate(centers):
-        if number and not free[order[number - 1]]:
-            continue
-        same = free & (torch.rad2deg(symmetric_angle_rad(candidates, center, symmetry))
-                       <= SAME_ANSWER_DEG)  # fmt: skip
-        answers.append((center, float(mass[same].sum())))
-        free &= ~same
-        if len(answers) > _NUM_ALTERNATIVES:
-            break
-    # The best stays first: it is what the network answers, even where merged masses rank higher.
-    return [answers[0], *sorted(answers[1:], key=lambda answer: -answer[1])]

@@ -96,7 +96,9 @@ def prepare_photograph(
     cut_out = given_mask is not None or bool(alpha.min() < 1.0)
     coverage = alpha if given_mask is None else alpha * given_mask
     coverage = coverage if region is None else coverage * region
-    composited = coverage[..., None] * color + (1.0 - coverage[..., None]) * background
+    composited = color
+    if cut_out or region is not None:
+        composited = coverage[..., None] * color + (1.0 - coverage[..., None]) * background
 
     if cut_out or region is not None:
         crop_box = _object_crop(
@@ -105,6 +107,8 @@ def prepare_photograph(
         )
     else:
         crop_box = _whole_crop(alpha.shape, margin=margin)
+    if composited.strides[2] == 0:  # a gray picture: all channels are one
+        composited = composited[..., :1]
     if not cut_out:
         inside = composited if region is None else _crop_to(composited, region)
         warnings += _border_warnings(inside, background=background)
@@ -113,9 +117,12 @@ def prepare_photograph(
             f"The crop is only {crop_box[2] - crop_box[0]:.0f} px wide and is enlarged to "
             f"{image_size} px: use a picture in which the object is larger."
         )
-    pixels = _resample(composited, crop_box, image_size=image_size, background=background)
+    pixels = _resample(
+        _to_channels(composited, channels=channels), crop_box,
+        image_size=image_size, background=background,
+    )  # fmt: skip
     return PreparedImage(
-        tensor=_to_channels(pixels, channels=channels),
+        tensor=torch.from_numpy(pixels).clamp(0.0, 1.0)[None],
         crop_box=crop_box,
         warnings=tuple(warnings),
         camera_from_crop=_camera_from_crop(intrinsics, crop_box=crop_box),
@@ -228,10 +235,10 @@ def _crop_to(pixels: np.ndarray, region: np.ndarray) -> np.ndarray:
 def _border_warnings(pixels: np.ndarray, *, background: float) -> list[str]:
     """Compare the picture's border with the background that the network was trained on."""
     width = max(1, round(0.01 * min(pixels.shape[:2])))
-    border = np.ones(pixels.shape[:2], dtype=bool)
-    border[width:-width, width:-width] = False
-    values = pixels[border]  # (N, 3)
-    typical = np.median(values, axis=0)
+    inner = pixels[width:-width]
+    sides = (pixels[:width], pixels[-width:], inner[:, :width], inner[:, -width:])
+    values = np.concatenate([side.reshape(-1, pixels.shape[2]) for side in sides])
+    typical = np.broadcast_to(np.median(values, axis=0), 3)
 
     def share_off(reference: np.ndarray | float) -> float:
         return float((np.abs(values - reference).max(axis=1) > _BORDER_TOLERANCE).mean())
@@ -248,42 +255,44 @@ def _border_warnings(pixels: np.ndarray, *, background: float) -> list[str]:
     return [f"The border is uniform, but its red/green/blue is {shown}. {help_text}"]
 
 
+def _to_channels(pixels: np.ndarray, *, channels: int) -> np.ndarray:
+    """Pixels (H, W, 1 | 3) as float32 (C, H, W)."""
+    if channels not in (1, 3):
+        raise ImageError(f"channels={channels}: photographs fit networks of 1 or 3 channels.")
+    planes = pixels.transpose(2, 0, 1).astype(np.float32, copy=False)
+    if len(planes) == 1:
+        return np.broadcast_to(planes, (channels, *planes.shape[1:]))
+    return ((planes[0] + planes[1] + planes[2]) / 3)[None] if channels == 1 else planes
+
+
 def _resample(
-    pixels: np.ndarray,
+    planes: np.ndarray,
     crop_box: tuple[float, float, float, float],
     *,
     image_size: int,
     background: float,
 ) -> np.ndarray:
-    """Cut a square out of (H, W, 3) and scale it to (S, S, 3); outside is background."""
-    height, width = pixels.shape[:2]
+    """Cut a square out of (C, H, W) and scale it to (C, S, S); outside is background."""
+    height, width = planes.shape[1:]
     x0, y0, x1, y1 = crop_box
     left, top, right, bottom = math.floor(x0), math.floor(y0), math.ceil(x1), math.ceil(y1)
-    window = pixels[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+    window = planes[:, max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
     padding = (
+        (0, 0),
         (max(-top, 0), max(bottom - height, 0)),
         (max(-left, 0), max(right - width, 0)),
-        (0, 0),
     )
-    padded = np.pad(window, padding, constant_values=background).astype(np.float32)
+    if any(map(any, padding)):
+        window = np.pad(window, padding, constant_values=background)
     box = (x0 - left, y0 - top, x1 - left, y1 - top)
     # Bilinear in PIL averages over the source pixels when it shrinks, and never overshoots.
     resized = [
-        Image.fromarray(np.ascontiguousarray(padded[..., channel])).resize(
+        Image.fromarray(np.ascontiguousarray(plane)).resize(
             (image_size, image_size), Image.Resampling.BILINEAR, box=box
         )
-        for channel in range(3)
+        for plane in window
     ]
-    return np.stack([np.asarray(channel) for channel in resized], axis=-1)
-
-
-def _to_channels(pixels: np.ndarray, *, channels: int) -> torch.Tensor:
-    """(S, S, 3) pixels as a (1, C, S, S) float32 tensor in [0, 1]."""
-    if channels not in (1, 3):
-        raise ImageError(f"channels={channels}: photographs fit networks of 1 or 3 channels.")
-    values = pixels.mean(axis=2, keepdims=True) if channels == 1 else pixels
-    tensor = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1))).float()
-    return tensor.clamp(0.0, 1.0)[None]
+    return np.stack([np.asarray(plane) for plane in resized])
 
 
 def _camera_from_crop(

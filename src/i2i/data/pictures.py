@@ -81,7 +81,11 @@ def _image_values(image: Image.Image, *, warnings: list[str]) -> np.ndarray:
     if image.mode == "F":
         return _array_values(np.asarray(image), what="image")
     has_alpha = "A" in image.getbands() or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255.0
+    is_gray = image.mode == "L" and not has_alpha
+    shown = image if is_gray else image.convert("RGBA" if has_alpha else "RGB")
+    values = np.asarray(shown).astype(np.float32)
+    values /= 255.0
+    return values[..., None] if is_gray else values
 
 
 def _array_values(array: np.ndarray, *, what: str) -> np.ndarray:

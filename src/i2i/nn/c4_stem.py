@@ -24,7 +24,7 @@ from i2i.nn.batch_norm import update_running
 from i2i.nn.c4 import TURNS, C4Conv
 from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.native import stem as native_stem
-from i2i.nn.native.stem import StemGeometry
+from i2i.nn.native.stem import MAX_WINDOW, StemGeometry
 from i2i.nn.precision import full_precision
 from i2i.nn.processes import sum_over_processes
 
@@ -50,8 +50,8 @@ def stem_map(image: Tensor, conv: C4Conv, norm: C4BatchNorm, pool: nn.Module) ->
     with full_precision(image):
         image = image.detach().to(conv.weights.dtype).contiguous()
         kernel = conv.expand_parameters()[0].flatten(1)  # (4F, K)
-        form = _Compiled if native.is_built_for(image, image.dtype) else _Unfolded
-        stem = form(image, geometry)
+        compiled = native.is_built_for(image, image.dtype) and geometry.window <= MAX_WINDOW
+        stem = (_Compiled if compiled else _Unfolded)(image, geometry)
         out: Tensor = _PooledProduct.apply(_fold(kernel, norm, stem), stem)
         return out
 

@@ -11,6 +11,9 @@ from torch import Tensor
 from i2i.nn.native import functions, pointer
 
 
+MAX_WINDOW = 15  # a place in the window and "clipped" have to fit into a byte
+
+
 @dataclass(frozen=True)
 class StemGeometry:
     """Sizes of a convolution of square kernels and a max-pool after it.
@@ -19,7 +22,7 @@ class StemGeometry:
         kernel: Side of the kernel.
         stride: Step of the convolution.
         padding: Zeros on each side of the image.
-        window: Side of the max-pool's window, at most 15; 1 without a max-pool.
+        window: Side of the max-pool's window, here at most `MAX_WINDOW`; 1 without a max-pool.
         window_stride: Step of the windows.
         window_padding: Places outside of the map that the first window sees.
     """
