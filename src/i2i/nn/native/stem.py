@@ -10,7 +10,6 @@ from torch import Tensor
 
 from i2i.nn.native import functions, pointer
 
-
 MAX_WINDOW = 15  # a place in the window and "clipped" have to fit into a byte
 
 
