@@ -1,6 +1,7 @@
 """Predictor: a fake network whose answer is known, against independent conversions and geometry."""
 
 import json
+import weakref
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torch import nn
 from i2i.data.info import DataInfo
 from i2i.errors import CheckpointError, ConfigurationError, ImageError
 from i2i.models.prediction import ClassPrediction, PosePrediction
+from i2i.network_input import see
 from i2i.prediction_results import ClassResult
 from i2i.predictor import Predictor
 from i2i.rendering.mesh import prepare_mesh
@@ -274,7 +276,8 @@ def test_a_bad_picture_is_told_in_its_turn(tmp_path):
         next(stream)
 
 
-def test_pictures_are_taken_no_more_than_two_batches_ahead():
+@pytest.mark.parametrize("read_ahead", [None, False, True])
+def test_pictures_are_taken_no_more_than_two_batches_ahead(read_ahead):
     """A folder of any size fits into memory."""
     taken = 0
 
@@ -284,10 +287,33 @@ def test_pictures_are_taken_no_more_than_two_batches_ahead():
             taken += 1
             yield np.full((32, 32), 255, np.uint8)
 
-    stream = Predictor(FakeRows(), JOINT).predict_many(endless(), batch_size=4)
-    for number in range(1, 20):
+    stream = Predictor(FakeRows(), JOINT).predict_many(
+        endless(), batch_size=4, read_ahead=read_ahead
+    )
+    for number in range(20):
         next(stream)
-        assert taken <= number + 2 * 4
+        assert taken == 4 * (number // 4 + (2 if read_ahead else 1))
+
+
+@pytest.mark.parametrize("read_ahead", [False, True])
+def test_no_more_than_two_batches_are_held(read_ahead, monkeypatch):
+    """Of what was read, counted whenever one more is."""
+    alive, counts = set(), []
+
+    def watched(*given, **how):
+        seen = see(*given, **how)
+        alive.add(id(seen))
+        weakref.finalize(seen, alive.discard, id(seen))
+        counts.append(len(alive))
+        return seen
+
+    monkeypatch.setattr("i2i.predictor.see", watched)
+    picture = np.full((32, 32), 255, np.uint8)
+    predictor = Predictor(FakeRows(), JOINT)
+    results = predictor.predict_many([picture] * 40, batch_size=4, read_ahead=read_ahead)
+    for result in results:
+        del result
+    assert max(counts) == (8 if read_ahead else 4)
 
 
 def test_batches_of_nothing_are_refused():

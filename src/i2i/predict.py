@@ -38,7 +38,8 @@ def predict(cfg: DictConfig) -> dict[str, Path]:
     options = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(options, dict)
     paths = _inputs(Path(cfg.input), CLOUDS if predictor.info.num_points else PICTURES)
-    how = ("class_name", "mask", "box", "intrinsics", "margin", "axes", "batch_size", "workers")
+    how = ("class_name", "mask", "box", "intrinsics", "margin", "axes", "batch_size", "workers",
+           "read_ahead")  # fmt: skip
     results = predictor.predict_many(paths, **{name: options[name] for name in how})
     written: dict[str, Path] = {}
     for path, result in zip(paths, results, strict=True):

@@ -140,8 +140,9 @@ class Predictor:
         images: Iterable[Picture | Cloud],
         *,
         class_name: str | None = None,
-        batch_size: int = 64,
+        batch_size: int | None = None,
         workers: int = 2,
+        read_ahead: bool | None = None,
         **how: Any,  # noqa: ANN401 - passed on as they are
     ) -> Iterator[PoseResult | ClassResult]:
         """Answer for many pictures or clouds, in their order, a batch at a time.
@@ -151,8 +152,12 @@ class Predictor:
         Args:
             images: Pictures or clouds, see `predict`.
             class_name: Class of all of them, see `predict`.
-            batch_size: How many go through the network at once.
+            batch_size: How many go through the network at once, and are waited for before the
+                first answer; 64 pictures or 16 clouds if None.
             workers: Threads that read and crop.
+            read_ahead: Whether they read the next batch while the network is busy. If None, not
+                on a CPU, where they would hold up what computes; it is worth it there where
+                reading is waiting, such as for a slow disk.
             **how: `mask`, `box`, `intrinsics`, `margin` and `axes` of `predict`, for all.
 
         Yields:
@@ -164,6 +169,8 @@ class Predictor:
             ImageError: as `predict`.
             CheckpointError: as `predict`.
         """
+        if batch_size is None:
+            batch_size = 16 if self.info.num_points else 64
         if batch_size < 1 or workers < 1:
             raise ConfigurationError(
                 f"batch_size={batch_size} and workers={workers} must be at least 1"
@@ -171,9 +178,9 @@ class Predictor:
         if class_name is not None:
             self._check_class(class_name)
         prepare = partial(see, info=self.info, **how)
-        # One batch is read while a GPU is busy with another. A CPU has to do both: threads that
-        # read would only hold up those that compute.
-        lead = 0 if self.device.type == "cpu" else 1
+        if read_ahead is None:
+            read_ahead = self.device.type != "cpu"
+        lead = int(read_ahead)
         for batch in in_batches(prepare, images, workers=workers, size=batch_size, lead=lead):
             seen: list[Seen] = []
             for future in batch:
@@ -181,6 +188,7 @@ class Predictor:
                     yield from self._answer(seen, class_name)
                 seen.append(future.result())
             yield from self._answer(seen, class_name)
+            del seen, batch, future  # before another one is read
 
     def _answer(
         self, seen: list[Seen], class_name: str | None

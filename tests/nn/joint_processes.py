@@ -1,11 +1,13 @@
 """What the tests of batch norm over processes run in each of them."""
 
 import copy
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
 from torch import Tensor, distributed, nn
 
+from i2i.nn import native
 from i2i.nn.c4_dispatch import convolution_mode
 from i2i.nn.c4_norm import C4BatchNorm
 
@@ -13,14 +15,24 @@ PROCESSES = 2
 
 
 class PixelMajor(nn.Module):
-    """C4 batch norm of pixel-major maps, the batch first for once, with ReLU."""
+    """C4 batch norm of pixel-major maps, the batch first for once, with ReLU.
 
-    def __init__(self, fields):
+    With a shortcut, or in torch's form in the second process only, as where one machine has no
+    compiler.
+    """
+
+    def __init__(self, fields, *, with_shortcut=False, mixed=False):
         super().__init__()
         self.norm = C4BatchNorm(fields)
+        self.with_shortcut, self.mixed = with_shortcut, mixed
 
     def forward(self, x):
-        out = self.norm.pixel_major(x.permute(1, 2, 3, 0).contiguous(), relu=True)
+        x = x.permute(1, 2, 3, 0).contiguous()
+        shortcut = 0.5 * x if self.with_shortcut else None
+        # The backward pass of one form is that form's.
+        is_torch = self.mixed and distributed.is_initialized() and distributed.get_rank() == 1
+        with native.torch_only() if is_torch else nullcontext():
+            out = self.norm.pixel_major(x, shortcut=shortcut, relu=True)
         return out.permute(3, 0, 1, 2)
 
 

@@ -29,6 +29,8 @@ LAYERS = {
     "one row each": (RowNorm(3), (2, 3)),
     "C4 fields": (C4BatchNorm(3), (6, 12, 4, 4)),
     "pixel-major": (PixelMajor(3), (6, 16, 4, 3)),
+    "with a shortcut": (PixelMajor(3, with_shortcut=True), (6, 16, 4, 3)),
+    "in two forms": (PixelMajor(3, with_shortcut=True, mixed=True), (6, 16, 4, 3)),
     "torch's own": (nn.BatchNorm2d(3), (6, 3, 4, 5)),
 }
 # Far from zero: E[x²] − mean² would lose its digits here.

@@ -114,6 +114,9 @@ def test_one_image_is_convolved_as_a_product(in_kind, size, stride, bias, monkey
         parameter.data.mul_(2.0)  # no version counter sees this
     assert relative_error(layer(image), 2 * expected) < 1e-6
     assert not conv2d.called
+    with pytest.raises(RuntimeError):
+        layer(image.double())  # as for several images
+    conv2d.reset_mock()
     layer(image.repeat(2, 1, 1, 1))
     assert conv2d.call_count == 1
 

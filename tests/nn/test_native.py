@@ -99,7 +99,7 @@ def test_nothing_behind_an_array_is_written(fields, batch, monkeypatch):
     stem = _Compiled(torch.randn(2, 1, 4 * fields, 4 * fields), StemGeometry(5, 2, 2, 3, 2, 1))
     stem.moments()
     seen, kept = stem.forward(torch.randn(fields, 26), wants_places=True)
-    stem.backward(seen, *kept)
+    stem.backward(stem.geometry, stem.image_size, seen, *kept)
     assert len(made) > 12
     assert all((room == 7.0).all() for room in made)
     assert (back != 7.0).all()
@@ -168,7 +168,7 @@ def test_the_stem_is_that_of_torch(colours, channels, size, geometry, dtype, bat
 
     def outcome(stem):
         out, kept = stem.forward(weight, wants_places=True)
-        return [stem.moments(), out, stem.backward(upstream, *kept)]
+        return [stem.moments(), out, stem.backward(geometry, images.shape[2:], upstream, *kept)]
 
     expected = outcome(_Unfolded(images, geometry))
     assert expected[1].count_nonzero() < expected[1].numel()
@@ -179,6 +179,11 @@ def test_the_stem_is_that_of_torch(colours, channels, size, geometry, dtype, bat
             assert relative_error(ours, theirs) < tolerance
 
 
+def test_windows_that_see_nothing_of_the_map_are_refused():
+    with pytest.raises(ValueError, match="window_padding=2"):
+        StemGeometry(5, 2, 2, 3, 2, 2)
+
+
 @needs_library
 def test_the_stem_takes_the_first_of_equal_places_and_what_is_not_a_number():
     """Where torch's max-pool looks, so that its gradient is the same."""
@@ -186,7 +191,7 @@ def test_the_stem_takes_the_first_of_equal_places_and_what_is_not_a_number():
     images[0, 0, 5, 6], images[0, 0, 9, 2] = float("nan"), 3.0
     weight = torch.tensor([[1.0, 0.5], [-1.0, 0.0], [-1.0, 0.25]])
     geometry = StemGeometry(1, 1, 0, 3, 2, 1)
-    out, (places,) = _Compiled(images, geometry).forward(weight, wants_places=True)
+    out, (_, places) = _Compiled(images, geometry).forward(weight, wants_places=True)
     maps = torch.einsum("ck,bkhw->bchw", weight, torch.cat([images, torch.ones_like(images)], 1))
     expected, where = torch.nn.functional.max_pool2d(maps, 3, 2, 1, return_indices=True)
     assert torch.equal(out.isnan(), expected.isnan())
@@ -274,6 +279,18 @@ def test_the_gradient_of_the_largest_turn_is_that_of_torch(dtype, batch):
 
     for ours, expected in zip(outcome(), in_torch(outcome), strict=True):
         torch.testing.assert_close(ours, expected)
+
+
+@needs_library
+def test_the_gradient_of_the_largest_turn_lets_what_is_not_a_number_through():
+    x = torch.randn(1, 4, 3, 5)
+    x[0, 0, 0, 1] = x[0, 2, 1, 3] = float("nan")
+    x.requires_grad_()
+    ours, expected = (
+        torch.autograd.grad(y.sum(), x)[0] for y in (turn_max(x), in_torch(turn_max, x))
+    )
+    torch.testing.assert_close(ours, expected, equal_nan=True)
+    assert ours.isnan().sum() == 8
 
 
 def test_the_gradient_of_a_layout_is_the_layout_back():

@@ -83,12 +83,12 @@ def _joint_moments(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def joint_moments(mean: Tensor, var: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The moments over all processes from those of this one, (C,), float64, and the joint count.
+    """The moments over all processes, float64, from those of this one, (C,); and the joint count.
 
     Every process tells its own two and they are put together: var = E[var_r + (mean_r − mean)²],
     which keeps the digits that E[x²] − mean² would lose.
     """
-    ours = torch.cat([mean.double(), var.double(), mean.new_tensor([count]).double()])
+    ours = torch.cat([mean.double(), var.double(), mean.new_full((1,), count, dtype=torch.float64)])
     parts = [torch.empty_like(ours) for _ in range(num_processes())]
     distributed.all_gather(parts, ours)
     together = torch.stack(parts)
@@ -137,14 +137,16 @@ class _Normalise(torch.autograd.Function):
         grad, wide = at_least_float32(grad), at_least_float32(x)
         centred = wide - _along_channels(mean, x)
         of_bias = grad.sum(dim=_others(x)).double()
-        of_weight = (grad * centred).sum(dim=_others(x)).double() * inverse_std
-        # Of the losses of all processes: every one of them changes with the shared moments.
-        all_bias, all_weight = sum_over_processes(of_bias, of_weight)
+        product = (grad * centred).sum(dim=_others(x)).double()
+        # Of the losses of all processes: every one of them changes with the shared moments. The
+        # same sums as the compiled form's (`c4_norm`), which another process may have.
+        all_bias, all_product = sum_over_processes(of_bias, product)
         scale = weight.double() * inverse_std
         of_x = torch.addcmul(
             grad - _along_channels(all_bias / count, x),
             centred,
-            _along_channels(all_weight * inverse_std / count, x),
+            _along_channels(all_product * inverse_std.square() / count, x),
             value=-1,
         ).mul_(_along_channels(scale, x))
+        of_weight = product * inverse_std
         return of_x.to(x.dtype), of_weight.to(weight), of_bias.to(weight), None, None, None

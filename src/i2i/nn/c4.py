@@ -188,9 +188,8 @@ class C4Conv(R2Conv):
             return kernel, None
         return kernel, (self.bias[:, None] * self.bias_scale).flatten()
 
-    def _kernel(self) -> Tensor:
-        """The expanded kernel in the type of the products, from the cache where that is safe."""
-        dtype = product_dtype(self.weights)
+    def _kernel(self, dtype: torch.dtype) -> Tensor:
+        """The expanded kernel, from the cache where that is safe."""
         return self._cached(("dense", dtype), lambda: self.expand_parameters()[0].to(dtype))
 
     def _cached(self, key: object, make: Callable[[], Tensor]) -> Tensor:
@@ -241,7 +240,9 @@ class C4Conv(R2Conv):
     def _pointwise(self, x: Tensor) -> Tensor:
         """A 1×1 convolution as two products, of x_g + x_{g+2} and of x_g − x_{g+2}."""
         pixels, _, _, batch = x.shape
-        kernel = self._kernel().view(self.out_fields, TURNS, self.in_fields, TURNS)
+        kernel = self._kernel(self.weights.dtype).view(
+            self.out_fields, TURNS, self.in_fields, TURNS
+        )
         first, second = kernel[:, :2].permute(1, 0, 3, 2).unflatten(2, (2, 2)).unbind(2)
         halves = x.view(pixels, 2, -1, batch)
         mixed = []
@@ -275,7 +276,8 @@ class C4Conv(R2Conv):
                 f"expected (B, {self.in_type.size}, H, W) for {self.in_fields} fields, "
                 f"got {tuple(input.shape)}"
             )
-        kernel, where = self._kernel(), {"stride": self.stride, "padding": self.padding}
+        kernel = self._kernel(product_dtype(self.weights))
+        where = {"stride": self.stride, "padding": self.padding}
         if takes_patches(input, kernel):
             # A library's convolution rearranges the kernel at every call: with one image that is
             # most of its time.

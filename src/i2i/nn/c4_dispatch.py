@@ -88,6 +88,7 @@ def takes_patches(x: Tensor, kernel: Tensor) -> bool:
     """
     return (
         _MODE[0] == "auto"
+        and product_dtype(x) == kernel.dtype
         and len(x) == 1
         and x.device.type == "cpu"
         and kernel[0].numel() >= _LEAST_TAPS

@@ -43,10 +43,10 @@ def stem_map(image: Tensor, conv: C4Conv, norm: C4BatchNorm, pool: nn.Module) ->
     Returns:
         (B, conv.out_type.size, H', W'), channels last.
     """
-    geometry = StemGeometry(conv.kernel_size, conv.stride, conv.padding)
+    window = (1, 1, 0)
     if isinstance(pool, nn.MaxPool2d):
         window = (int(pool.kernel_size), int(pool.stride), int(pool.padding))  # type: ignore[arg-type]
-        geometry = StemGeometry(conv.kernel_size, conv.stride, conv.padding, *window)
+    geometry = StemGeometry(conv.kernel_size, conv.stride, conv.padding, *window)
     with full_precision(image):
         image = image.detach().to(conv.weights.dtype).contiguous()
         kernel = conv.expand_parameters()[0].flatten(1)  # (4F, K)
@@ -60,10 +60,7 @@ class _Unfolded:
     """The images of one step, by torch: patches (B, K + 1, places) are written to memory."""
 
     def __init__(self, images: Tensor, geometry: StemGeometry) -> None:
-        self.geometry = geometry
-        self.full = geometry.map_size(*images.shape[2:])
-        self.small = geometry.out_size(*images.shape[2:])
-        self.window = (geometry.window, geometry.window_stride, geometry.window_padding)
+        self.geometry, self.image_size = geometry, images.shape[2:]
         patches = functional.unfold(
             images, geometry.kernel, padding=geometry.padding, stride=geometry.stride
         )
@@ -80,29 +77,37 @@ class _Unfolded:
 
     def forward(self, weight: Tensor, *, wants_places: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
         """ReLU(max-pool(weight · patches)), and what its gradient needs."""
-        out = weight.new_empty(len(self.patches), *self.small, len(weight)).permute(0, 3, 1, 2)
+        small = self.geometry.out_size(*self.image_size)
+        full = self.geometry.map_size(*self.image_size)
+        out = weight.new_empty(len(self.patches), *small, len(weight)).permute(0, 3, 1, 2)
         places = []
         parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (self.patches, out))
         for some, into in zip(*parts, strict=True):
             rows = torch.matmul(some.mT, weight.mT)  # (b, places, 4F)
-            maps = rows.view(len(some), *self.full, -1).permute(0, 3, 1, 2)
-            if self.geometry.window > 1:
-                maps, where = functional.max_pool2d(maps, *self.window, return_indices=True)
+            maps = rows.view(len(some), *full, -1).permute(0, 3, 1, 2)
+            if self.geometry.is_pooled:
+                maps, where = functional.max_pool2d(
+                    maps, *self.geometry.pooling, return_indices=True
+                )
                 places += [where] if wants_places else []
             torch.clamp(maps, min=0.0, out=into)
-        return out, (out, *places)
+        return out, (self.patches, out, *places)
 
-    def backward(self, grad: Tensor, out: Tensor, *places: Tensor) -> Tensor:
+    @staticmethod
+    def backward(
+        geometry: StemGeometry, image_size: torch.Size, grad: Tensor, *kept: Tensor
+    ) -> Tensor:
         """Gradient of the weight (4F, K + 1)."""
-        channels = out.shape[1]
-        weight = grad.new_zeros(channels, self.patches.shape[1])
-        parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (self.patches, out, grad))
-        for index, (some, kept, upstream) in enumerate(zip(*parts, strict=True)):
+        patches, out, *places = kept
+        channels, full = out.shape[1], geometry.map_size(*image_size)
+        weight = grad.new_zeros(channels, patches.shape[1])
+        parts = (tensor.split(_IMAGES_AT_ONCE) for tensor in (patches, out, grad))
+        for index, (some, seen, upstream) in enumerate(zip(*parts, strict=True)):
             # Channels last, like the maps: a gradient of another layout is copied.
-            upstream = (upstream * (kept > 0)).contiguous(memory_format=torch.channels_last)
+            upstream = (upstream * (seen > 0)).contiguous(memory_format=torch.channels_last)
             if places:
-                like = upstream.new_empty(len(some), *self.full, channels).permute(0, 3, 1, 2)
-                size, step, padding = ([side] * 2 for side in self.window)
+                like = upstream.new_empty(len(some), *full, channels).permute(0, 3, 1, 2)
+                size, step, padding = ([side] * 2 for side in geometry.pooling)
                 upstream = torch.ops.aten.max_pool2d_with_indices_backward(
                     upstream, like, size, step, padding, [1, 1], False, places[index]
                 )
@@ -115,7 +120,7 @@ class _Compiled:
     """The same by `native.stem`: a few rows of patches and maps at a time are in the cache."""
 
     def __init__(self, images: Tensor, geometry: StemGeometry) -> None:
-        self.images, self.geometry = images, geometry
+        self.images, self.geometry, self.image_size = images, geometry, images.shape[2:]
 
     def moments(self) -> Tensor:
         return native_stem.moments(self.images, self.geometry)
@@ -124,10 +129,13 @@ class _Compiled:
         out, places = native_stem.forward(
             self.images, weight, self.geometry, wants_places=wants_places
         )
-        return out, () if places is None else (places,)
+        return out, () if places is None else (self.images, places)
 
-    def backward(self, grad: Tensor, places: Tensor) -> Tensor:
-        return native_stem.backward(self.images, grad, places, self.geometry).to(grad)
+    @staticmethod
+    def backward(
+        geometry: StemGeometry, _: torch.Size, grad: Tensor, images: Tensor, places: Tensor
+    ) -> Tensor:
+        return native_stem.backward(images, grad, places, geometry).to(grad)
 
 
 def _fold(kernel: Tensor, norm: C4BatchNorm, stem: "_Unfolded | _Compiled") -> Tensor:
@@ -166,10 +174,12 @@ class _PooledProduct(torch.autograd.Function):
     def forward(ctx: FunctionCtx, weight: Tensor, stem: "_Unfolded | _Compiled") -> Tensor:
         out, kept = stem.forward(weight, wants_places=ctx.needs_input_grad[0])  # type: ignore[attr-defined]
         ctx.save_for_backward(*kept)
-        ctx.stem = stem  # type: ignore[attr-defined]
+        # The stem itself would keep the images alive for as long as the graph is held.
+        ctx.form = type(stem).backward, stem.geometry, stem.image_size  # type: ignore[attr-defined]
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.stem.backward(grad, *ctx.saved_tensors), None  # type: ignore[attr-defined]
+        backward, *sizes = ctx.form  # type: ignore[attr-defined]
+        return backward(*sizes, grad, *ctx.saved_tensors), None  # type: ignore[attr-defined]

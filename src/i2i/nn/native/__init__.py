@@ -1,9 +1,10 @@
-"""The transforms of the C4-spectral convolution as compiled code, where a compiler was found.
+"""What the C4 network spends its time with, as compiled code, where a compiler was found.
 
 `hatch_build.py` builds the sources beside this file when i2i is installed, once for each set of
 instructions. Without a library for this processor, on other map sizes and on other devices
-:func:`is_built_for` and :func:`has_compiled_transform` say so, and `c4_spectral` computes the same
-with torch.
+:func:`is_built_for` and :func:`has_compiled_transform` say so, and the callers compute the same
+with torch: transforms and blocks (`c4_spectral`), layouts and the largest turn (`pixel_major`),
+batch norm (`c4_norm`) and, in `native.stem`, the first layer (`c4_stem`).
 """
 
 from __future__ import annotations

@@ -141,11 +141,6 @@ void gradient_of(const S* blocks, const T* matrix, T* gradient, int64_t orbits, 
   }
 }
 
-template <class T>
-const T* as(const void* pointer) {
-  return static_cast<const T*>(pointer);
-}
-
 }  // namespace
 
 extern "C" {
@@ -154,13 +149,13 @@ extern "C" {
 void i2i_blocks(const void* coefficients, const void* matrix, void* blocks, int type,
                 int64_t orbits, int64_t outs, int64_t ins, int64_t count, int threads) {
   if (type == 0) {
-    blocks_of(as<float>(coefficients), as<float>(matrix), static_cast<float*>(blocks), orbits,
+    blocks_of(as<float>(coefficients), as<float>(matrix), as<float>(blocks), orbits,
               outs, ins, count, threads);
   } else if (type == 1) {
-    blocks_of(as<float>(coefficients), as<float>(matrix), static_cast<uint16_t*>(blocks), orbits,
+    blocks_of(as<float>(coefficients), as<float>(matrix), as<uint16_t>(blocks), orbits,
               outs, ins, count, threads);
   } else {
-    blocks_of(as<double>(coefficients), as<double>(matrix), static_cast<double*>(blocks), orbits,
+    blocks_of(as<double>(coefficients), as<double>(matrix), as<double>(blocks), orbits,
               outs, ins, count, threads);
   }
 }
@@ -169,13 +164,13 @@ void i2i_coefficient_gradient(const void* blocks, const void* matrix, void* grad
                               int64_t orbits, int64_t outs, int64_t ins, int64_t count,
                               int threads) {
   if (type == 0) {
-    gradient_of(as<float>(blocks), as<float>(matrix), static_cast<float*>(gradient), orbits, outs,
+    gradient_of(as<float>(blocks), as<float>(matrix), as<float>(gradient), orbits, outs,
                 ins, count, threads);
   } else if (type == 1) {
-    gradient_of(as<uint16_t>(blocks), as<float>(matrix), static_cast<float*>(gradient), orbits,
+    gradient_of(as<uint16_t>(blocks), as<float>(matrix), as<float>(gradient), orbits,
                 outs, ins, count, threads);
   } else {
-    gradient_of(as<double>(blocks), as<double>(matrix), static_cast<double*>(gradient), orbits,
+    gradient_of(as<double>(blocks), as<double>(matrix), as<double>(gradient), orbits,
                 outs, ins, count, threads);
   }
 }

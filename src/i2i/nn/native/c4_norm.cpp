@@ -219,16 +219,6 @@ struct Backward {
   }
 };
 
-template <class T>
-const T* as(const void* pointer) {
-  return static_cast<const T*>(pointer);
-}
-
-template <class T>
-T* as(void* pointer) {
-  return static_cast<T*>(pointer);
-}
-
 }  // namespace
 
 extern "C" {

@@ -123,7 +123,7 @@ void forward(const T* images, const T* weight, T* out, uint8_t* where, const I2i
   constexpr int size = Lane<T>::size;
   const int64_t channels = round_up(shape.channels, kVectors * size);
   const int64_t row = shape.out_width * shape.channels;
-  Ring<T> kernel = turned_over(weight, Patches<T>(shape).count, shape.channels, channels);
+  Ring<T> kernel = turned_over(weight, Patches<T>::count_of(shape), shape.channels, channels);
   // Several bands of rows where there are fewer images than threads.
   const int64_t bands = shape.batch >= threads ? 1 : threads;
 #pragma omp parallel num_threads(threads)
@@ -231,7 +231,7 @@ void add_image(const T* image, const T* grad, const uint8_t* where, const I2iSte
 template <class T>
 void backward(const T* images, const T* grad, const uint8_t* where, double* result,
               const I2iStem& shape, int threads) {
-  const int64_t depth = Patches<T>(shape).depth, count = Patches<T>(shape).count;
+  const int64_t depth = Patches<T>::depth_of(shape), count = Patches<T>::count_of(shape);
   const int64_t entries = shape.channels * depth;
   const int64_t windows = shape.out_height * shape.out_width * shape.channels;
   std::vector<double> totals(threads * entries);
@@ -288,7 +288,7 @@ void add_products(const double* row, int64_t places, int64_t rows, int64_t depth
 // `result` (K + 1, K + 1): sum over images and places of patch[i] patch[j].
 template <class T>
 void moments(const T* images, double* result, const I2iStem& shape, int threads) {
-  const int64_t depth = Patches<T>(shape).depth, count = Patches<T>(shape).count;
+  const int64_t depth = Patches<T>::depth_of(shape), count = Patches<T>::count_of(shape);
   const int64_t rows = round_up(count + 1, kTogether);
   std::vector<double> totals(threads * depth * depth);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
@@ -315,11 +315,6 @@ void moments(const T* images, double* result, const I2iStem& shape, int threads)
   }
 }
 
-template <class T>
-const T* as(const void* pointer) {
-  return static_cast<const T*>(pointer);
-}
-
 }  // namespace
 
 extern "C" {
@@ -328,10 +323,10 @@ extern "C" {
 void i2i_stem(const void* images, const void* weight, void* out, uint8_t* where,
               const I2iStem* shape, int is_double, int threads) {
   if (is_double) {
-    forward(as<double>(images), as<double>(weight), static_cast<double*>(out), where, *shape,
+    forward(as<double>(images), as<double>(weight), as<double>(out), where, *shape,
             threads);
   } else {
-    forward(as<float>(images), as<float>(weight), static_cast<float*>(out), where, *shape, threads);
+    forward(as<float>(images), as<float>(weight), as<float>(out), where, *shape, threads);
   }
 }
 

@@ -22,6 +22,16 @@ typedef Lane<float>::Vec Floats;
 typedef uint32_t Bits __attribute__((vector_size(kLineBytes)));
 typedef uint16_t Halves __attribute__((vector_size(kLineBytes / 2)));
 
+template <class T>
+inline const T* as(const void* pointer) {
+  return static_cast<const T*>(pointer);
+}
+
+template <class T>
+inline T* as(void* pointer) {
+  return static_cast<T*>(pointer);
+}
+
 // ---- vectors in memory: as they are, or float as bfloat16 (uint16) ----
 
 inline Floats to_memory(Floats v, const float*) { return v; }

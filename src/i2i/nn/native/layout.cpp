@@ -68,12 +68,15 @@ void turn_max_backward(const T* maps, const T* grad, T* result, int64_t pixels, 
         turns[g] = load_one<T>(maps + (pixel * kTurns + g) * size + i, count);
       }
       Vec best = turns[0], times = {};
-      for (int g = 1; g < kTurns; ++g) best = turns[g] > best ? turns[g] : best;
+      for (int g = 1; g < kTurns; ++g) {
+        best = (turns[g] > best) | (turns[g] != turns[g]) ? turns[g] : best;
+      }
       for (int g = 0; g < kTurns; ++g) times += turns[g] == best ? Vec{} + 1 : Vec{};
       const Vec share = load_one<T>(grad + pixel * size + i, count) / times;
+      const Vec rest = best - best;  // zero, or not a number where the largest is none
       for (int g = 0; g < kTurns; ++g) {
         store_one<T>(result + (pixel * kTurns + g) * size + i, count,
-                     turns[g] == best ? share : Vec{}, in_lines);
+                     turns[g] == best ? share : rest, in_lines);
       }
     }
     finish_streams();
@@ -87,10 +90,10 @@ extern "C" void i2i_turn_over(const void* from, void* to, int to_pixel_major, in
                               int64_t rows, int64_t fields, int64_t columns, int threads) {
   const bool forward = to_pixel_major != 0;
   if (is_double) {
-    turn_over(static_cast<const double*>(from), static_cast<double*>(to), forward, rows, fields,
+    turn_over(as<double>(from), as<double>(to), forward, rows, fields,
               columns, threads);
   } else {
-    turn_over(static_cast<const float*>(from), static_cast<float*>(to), forward, rows, fields,
+    turn_over(as<float>(from), as<float>(to), forward, rows, fields,
               columns, threads);
   }
 }
@@ -99,10 +102,10 @@ extern "C" void i2i_turn_over(const void* from, void* to, int to_pixel_major, in
 extern "C" void i2i_turn_max_backward(const void* maps, const void* grad, void* result, int is_double,
                                       int64_t pixels, int64_t size, int threads) {
   if (is_double) {
-    turn_max_backward(static_cast<const double*>(maps), static_cast<const double*>(grad),
-                      static_cast<double*>(result), pixels, size, threads);
+    turn_max_backward(as<double>(maps), as<double>(grad),
+                      as<double>(result), pixels, size, threads);
   } else {
-    turn_max_backward(static_cast<const float*>(maps), static_cast<const float*>(grad),
-                      static_cast<float*>(result), pixels, size, threads);
+    turn_max_backward(as<float>(maps), as<float>(grad),
+                      as<float>(result), pixels, size, threads);
   }
 }

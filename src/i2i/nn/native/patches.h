@@ -52,7 +52,8 @@ class Ring {
   std::vector<T> memory_;
 };
 
-// Makes rows of patches (place, depth): depth is K + 1, filled up with zeros.
+// Makes rows of patches (place, depth): K numbers and a 1, and after them what happens to be there.
+// Behind the places of a row there is room for one more, which the last window's stride may reach.
 template <class T>
 class Patches {
  public:
@@ -60,10 +61,17 @@ class Patches {
       : shape_(shape),
         length_(shape.image_width + 2 * shape.padding + std::max(shape.kernel, kWhole)),
         lines_(shape.colours * shape.kernel * length_),
-        count(shape.colours * shape.kernel * shape.kernel),
-        depth(round_up(count + 1, kVectors * Lane<T>::size)),
+        count(count_of(shape)),
+        depth(depth_of(shape)),
         places(round_up(shape.width, kPlaces)),
         row_size((places + 1) * depth) {}
+
+  static int64_t count_of(const I2iStem& shape) {
+    return shape.colours * shape.kernel * shape.kernel;
+  }
+  static int64_t depth_of(const I2iStem& shape) {
+    return round_up(count_of(shape) + 1, kVectors * Lane<T>::size);
+  }
 
   void fill(const T* image, int64_t y, T* to) {
     const int64_t k = shape_.kernel, lines = shape_.colours * k;

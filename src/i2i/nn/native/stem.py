@@ -33,6 +33,24 @@ class StemGeometry:
     window_stride: int = 1
     window_padding: int = 0
 
+    def __post_init__(self) -> None:
+        """Refuse what torch refuses: a window that sees nothing of the map."""
+        if self.window < 1 or 2 * self.window_padding > self.window:
+            raise ValueError(
+                f"window={self.window} with window_padding={self.window_padding}: the padding is "
+                "at most half of the window"
+            )
+
+    @property
+    def pooling(self) -> tuple[int, int, int]:
+        """Side, step and padding of the windows."""
+        return self.window, self.window_stride, self.window_padding
+
+    @property
+    def is_pooled(self) -> bool:
+        """Whether the windows are more than the places themselves."""
+        return self.pooling != (1, 1, 0)
+
     def map_size(self, height: int, width: int) -> tuple[int, int]:
         """Of the convolution's result."""
         return _steps(height, width, self.kernel, self.stride, self.padding)
