@@ -5,7 +5,7 @@
 //
 //   y[c] = sum_k weight[k][c] patch[k],    k = 0 .. K, the last weight being the bias,
 //   out[c] = max(0, max of y[c] over a window),
-//   dweight[c][k] = sum over windows of dout[c] patch[k] at the place of the maximum.
+//   gradient[c][k] = sum over windows of upstream[c] patch[k] at the place of the maximum.
 //
 // So the gradient takes one product for each window, not one for each place.
 
