@@ -6,7 +6,8 @@ python benchmarks/network_speed.py --scale small --repeats 9
 python benchmarks/network_speed.py --device cuda --repeats 20
 
 The peers are escnn's dense layers with correct residual blocks and the direct head (`published`),
-and the encoder's widths in plain torch.nn with our head (`plain`). Variants run alternately in one
+and the encoder's widths in plain torch.nn with our head (`plain`). `ours by torch` leaves the
+compiled code aside (`i2i.nn.native`). Variants run alternately in one
 process; what counts are the ratios. Before anything is timed the published peer has to give the
 same answers. Writes `benchmarks/results/<name>.json`, `.md` and `.png`; an earlier JSON of the same
 name is what the new ratios are shown beside, and keeps the parts that are not measured again.
@@ -18,6 +19,7 @@ import platform
 import resource
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from alternation import Timing, alternate
 from i2i.configuration import compose
 from i2i.data.noise import noise_batch
 from i2i.memory import reuse_memory
+from i2i.nn import native
 from i2i.nn.folding import fold
 from i2i.runs.building import build_network, info_of
 from peers import DirectHead, PlainResNet18, escnn_encoder, published
@@ -35,6 +38,7 @@ from peers import DirectHead, PlainResNet18, escnn_encoder, published
 RESULTS = Path(__file__).parent / "results"
 PARTS = ("step", "inference", "head", "build")
 PEER = "published, fp32"
+BY_TORCH = "ours by torch"
 Timings = dict[str, Timing]
 
 
@@ -84,8 +88,15 @@ def contestants(
     check_peer(ours, peer, batch)
     plain = with_plain_encoder(network(scale)[0])
     nets = {"published": peer, "plain": plain, "ours": ours}
+    if device == "cpu" and native.library() is not None:
+        nets[BY_TORCH] = nets["ours"]
     batch = {name: value.to(device) for name, value in batch.items()}
     return {name: net.to(device) for name, net in nets.items()}, batch
+
+
+def form(name: str) -> AbstractContextManager[None]:
+    """What a variant runs under."""
+    return native.torch_only() if name == BY_TORCH else nullcontext()
 
 
 def training_steps(scale: str, device: str, repeats: int, batch_size: int) -> Timings:
@@ -97,12 +108,18 @@ def training_steps(scale: str, device: str, repeats: int, batch_size: int) -> Ti
         optimizer = torch.optim.SGD(net.parameters(), lr=1e-3, momentum=0.9, nesterov=True)
         for low in (False, True):
 
-            def step(net: nn.Module = net, optimizer: Any = optimizer, low: bool = low) -> None:  # noqa: ANN401
-                with autocast(device, low):
-                    loss = torch.stack(list(net.loss(net(batch), batch).values())).sum()
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
+            def step(
+                name: str = name,
+                net: nn.Module = net,
+                optimizer: Any = optimizer,
+                low: bool = low,  # noqa: ANN401
+            ) -> None:
+                with form(name):
+                    with autocast(device, low):
+                        loss = torch.stack(list(net.loss(net(batch), batch).values())).sum()
+                    optimizer.zero_grad()
+                    loss.backward()
+                    optimizer.step()
 
             variants[f"{name}, {'bf16' if low else 'fp32'}"] = step
     return alternate_on(device, variants, repeats=repeats, warm_up=2)
@@ -117,8 +134,8 @@ def inference(scale: str, device: str, repeats: int, batch_size: int) -> Timings
         net.eval()
         for low in (False, True):
 
-            def run(net: nn.Module = net, low: bool = low) -> None:
-                with torch.no_grad(), autocast(device, low):
+            def run(name: str = name, net: nn.Module = net, low: bool = low) -> None:
+                with form(name), torch.no_grad(), autocast(device, low):
                     net(batch)
 
             variants[f"{name}, {'bf16' if low else 'fp32'}"] = run

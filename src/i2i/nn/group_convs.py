@@ -61,16 +61,15 @@ class GroupCorrelation(nn.Module):
     def products(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
         """Every place of the signal with every place of f: (B, H, n · m) -> (B, m, H, V)."""
         batch = signal.shape[0]
-        # (B, H, n, m) -> (B, H, m, n): one product with the rows of f.
+        # (B, H, n, m) -> (B, m, H, n): one product with the rows of f, whose result lies right.
         psi = signal.view(batch, self.num_vertices, self.features, self.out_features)
-        psi = psi.transpose(2, 3).reshape(batch, -1, self.features)
+        psi = psi.permute(0, 3, 1, 2).reshape(batch, -1, self.features)
         if self.num_spheres == 1:
             products = psi @ self.sphere[0].T
         else:
             products = psi @ self.sphere[sphere_index].transpose(1, 2)
-        # (B, H · m, V) -> (B, m, H, V)
-        products = products.view(batch, self.num_vertices, self.out_features, self.sphere_size)
-        return products.transpose(1, 2)
+        # (B, m · H, V) -> (B, m, H, V)
+        return products.view(batch, self.out_features, self.num_vertices, self.sphere_size)
 
     def forward(self, signal: Tensor, sphere_index: Tensor | None = None) -> Tensor:
         """Correlate: (B, H, filter_channels), index (B,) into the spheres or None -> (B, 60, m)."""
