@@ -112,7 +112,7 @@ def training_steps(scale: str, device: str, repeats: int, batch_size: int) -> Ti
                 name: str = name,
                 net: nn.Module = net,
                 optimizer: Any = optimizer,
-                low: bool = low,  # noqa: ANN401
+                low: bool = low,
             ) -> None:
                 with form(name):
                     with autocast(device, low):
