@@ -111,7 +111,7 @@ def training_steps(scale: str, device: str, repeats: int, batch_size: int) -> Ti
             def step(
                 name: str = name,
                 net: nn.Module = net,
-                optimizer: Any = optimizer,
+                optimizer: torch.optim.Optimizer = optimizer,
                 low: bool = low,
             ) -> None:
                 with form(name):
