@@ -22,8 +22,8 @@ def disc_mask(image_size: int) -> Tensor:
 
     r is the distance from the image centre and t = (S − 1)/2, both in pixels. It takes the corners
     away, which a turn by anything but 90° would bring in from outside the picture. Below 1e-20 it
-    is 0: products with numbers that float32 cannot normalise take a processor a hundred times
-    longer than others, and there are enough of them at the edge to be felt.
+    is 0: products with numbers that float32 cannot normalise take a processor many times longer
+    than others, and there are enough of them at the edge to be felt.
     """
     offset = torch.arange(image_size, dtype=torch.float64) - (image_size - 1) / 2
     radius_squared = offset[:, None] ** 2 + offset[None, :] ** 2

@@ -141,37 +141,38 @@ void gradient_of(const S* blocks, const T* matrix, T* gradient, int64_t orbits, 
   }
 }
 
+// The types of coefficients and blocks: 0 float, 1 float and blocks of bfloat16, 2 double.
+template <class Act>
+void for_types(int type, const Act& act) {
+  if (type == 0) {
+    act(float(), float());
+  } else if (type == 1) {
+    act(float(), uint16_t());
+  } else {
+    act(double(), double());
+  }
+}
+
 }  // namespace
 
 extern "C" {
 
-// types: 0 float, 1 float and blocks of bfloat16, 2 double
 void i2i_blocks(const void* coefficients, const void* matrix, void* blocks, int type,
                 int64_t orbits, int64_t outs, int64_t ins, int64_t count, int threads) {
-  if (type == 0) {
-    blocks_of(as<float>(coefficients), as<float>(matrix), as<float>(blocks), orbits,
-              outs, ins, count, threads);
-  } else if (type == 1) {
-    blocks_of(as<float>(coefficients), as<float>(matrix), as<uint16_t>(blocks), orbits,
-              outs, ins, count, threads);
-  } else {
-    blocks_of(as<double>(coefficients), as<double>(matrix), as<double>(blocks), orbits,
-              outs, ins, count, threads);
-  }
+  for_types(type, [&](auto number, auto entry) {
+    typedef decltype(number) T;
+    blocks_of(as<T>(coefficients), as<T>(matrix), as<decltype(entry)>(blocks), orbits, outs, ins,
+              count, threads);
+  });
 }
 
 void i2i_coefficient_gradient(const void* blocks, const void* matrix, void* gradient, int type,
                               int64_t orbits, int64_t outs, int64_t ins, int64_t count,
                               int threads) {
-  if (type == 0) {
-    gradient_of(as<float>(blocks), as<float>(matrix), as<float>(gradient), orbits, outs,
-                ins, count, threads);
-  } else if (type == 1) {
-    gradient_of(as<uint16_t>(blocks), as<float>(matrix), as<float>(gradient), orbits,
-                outs, ins, count, threads);
-  } else {
-    gradient_of(as<double>(blocks), as<double>(matrix), as<double>(gradient), orbits,
-                outs, ins, count, threads);
-  }
+  for_types(type, [&](auto number, auto entry) {
+    typedef decltype(number) T;
+    gradient_of(as<decltype(entry)>(blocks), as<T>(matrix), as<T>(gradient), orbits, outs, ins,
+                count, threads);
+  });
 }
 }
