@@ -26,6 +26,7 @@ from i2i.nn.c4_spectral import (
     transform_matrix,
 )
 from i2i.nn.native import is_traced
+from i2i.nn.native.products import multiply, product
 from i2i.nn.precision import full_precision
 
 with warnings.catch_warnings():
@@ -251,7 +252,7 @@ class C4Conv(R2Conv):
             columns = halves[:, 0] + sign * halves[:, 1]
             columns = columns.transpose(0, 1).reshape(2 * self.in_fields, -1)
             # Half of the sum and of the difference of the two results.
-            mixed.append((0.5 * weights @ columns).view(-1, pixels, batch).to(x.dtype))
+            mixed.append(product(0.5 * weights, columns).view(-1, pixels, batch).to(x.dtype))
         out = torch.stack([mixed[0] + mixed[1], mixed[0] - mixed[1]])  # (2, 2 · fields, P, B)
         # The batch norm that follows wants it contiguous.
         return out.permute(2, 0, 1, 3).reshape(pixels, TURNS, self.out_fields, batch).contiguous()
@@ -284,7 +285,7 @@ class C4Conv(R2Conv):
             size = [(side + 2 * self.padding - self.kernel_size) // self.stride + 1
                     for side in input.shape[2:]]  # fmt: skip
             patches = nn.functional.unfold(input.to(kernel.dtype), self.kernel_size, **where)
-            out = (kernel.flatten(1) @ patches[0]).view(1, -1, *size)
+            out = multiply(kernel.flatten(1), patches[0]).view(1, -1, *size)
         else:
             out = nn.functional.conv2d(input, kernel, **where)
         if self.bias is None:

@@ -58,6 +58,7 @@ from i2i.nn.c4_spectral_constants import (
     padded_size,
 )
 from i2i.nn.c4_transforms import Spectrum, analyse, synthesise
+from i2i.nn.native.products import multiply
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major
 
 __all__ = [
@@ -89,7 +90,7 @@ def base_filters(kernel: Tensor) -> Tensor:
 
 def _multiply(blocks: Tensor, spectrum: Spectrum) -> Spectrum:
     """Multiply the blocks (n + 1, M, K) with a spectrum."""
-    return torch.bmm(blocks[:-1], spectrum[0]), torch.mm(blocks[-1], spectrum[1])
+    return multiply(blocks[:-1], spectrum[0]), multiply(blocks[-1], spectrum[1])
 
 
 def _coefficient_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor) -> Tensor:
@@ -118,11 +119,11 @@ def _compiled_gradient(upstream: Spectrum, spectrum: Spectrum, matrix: Tensor) -
     for first in range(0, orbits, _ORBITS_AT_ONCE):
         some = slice(first, min(first + _ORBITS_AT_ONCE, orbits))
         part = block[: some.stop - first]
-        torch.bmm(upstream[0][some], spectrum[0][some].mT, out=part)
+        multiply(upstream[0][some], spectrum[0][some].mT, out=part)
         native.add_coefficient_gradient(
             total, part, matrix[ORDER**2 * first : ORDER**2 * some.stop]
         )
-    torch.mm(upstream[1], spectrum[1].mT, out=block[0])
+    multiply(upstream[1], spectrum[1].mT, out=block[0])
     native.add_coefficient_gradient(total, block[:1], matrix[ORDER**2 * orbits :])
     return total.mT.contiguous()
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import MeshAxis, icosahedron
+from i2i.nn.native.products import product
 from i2i.nn.precision import full_precision
 
 
@@ -61,14 +62,15 @@ class GroupCorrelation(nn.Module):
     def products(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
         """Every place of the signal with every place of f: (B, H, n · m) -> (B, m, H, V)."""
         batch = signal.shape[0]
-        # (B, H, n, m) -> (B, m, H, n): one product with the rows of f, whose result lies right.
-        psi = signal.view(batch, self.num_vertices, self.features, self.out_features)
-        psi = psi.permute(0, 3, 1, 2).reshape(batch, -1, self.features)
+        psi = signal.reshape(-1, self.features, self.out_features)
         if self.num_spheres == 1:
-            products = psi @ self.sphere[0].T
-        else:
-            products = psi @ self.sphere[sphere_index].transpose(1, 2)
-        # (B, m · H, V) -> (B, m, H, V)
+            # (m, B · H, n) with the rows of f: (m, B · H, V).
+            products = product(psi.permute(2, 0, 1), self.sphere[0].T)
+            products = products.view(self.out_features, batch, self.num_vertices, -1)
+            return products.transpose(0, 1)
+        # (B, m · H, n) with the rows of each image's f: (B, m · H, V).
+        psi = psi.view(batch, -1, self.features, self.out_features).permute(0, 3, 1, 2)
+        products = psi.flatten(1, 2) @ self.sphere[sphere_index].transpose(1, 2)
         return products.view(batch, self.out_features, self.num_vertices, self.sphere_size)
 
     def forward(self, signal: Tensor, sphere_index: Tensor | None = None) -> Tensor:
@@ -76,13 +78,14 @@ class GroupCorrelation(nn.Module):
         check_signal(signal, (self.num_vertices, self.filter_channels))
         check_index(self.num_spheres, sphere_index)
         # Entry (v, u) of the last two axes is the product of ψ(v) and f(u).
-        products = self.products(signal, sphere_index)
-        products = products.reshape(signal.shape[0], self.out_features, -1)
+        products = self.products(signal, sphere_index).transpose(0, 1)
+        products = products.reshape(-1, len(self.pairs))  # (m · B, H · V)
         # Sums of rounded products are kept in full precision: logits differ by little.
         with full_precision(products):
-            out = products.to(self.pairs.dtype) @ self.pairs  # (B, m, 60)
+            out = product(products.to(self.pairs.dtype), self.pairs)
         bias = self.bias if self.num_spheres == 1 else self.bias[sphere_index]
-        return out.transpose(1, 2) + bias[:, None, :]
+        # (m, B, 60) -> (B, 60, m)
+        return out.view(self.out_features, len(signal), -1).permute(1, 2, 0) + bias[:, None, :]
 
 
 class DynamicFilterConv(GroupCorrelation):

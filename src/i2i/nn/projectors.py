@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import MeshAxis, icosahedron
 from i2i.nn.group_conv_variants import READINGS, support_elements
+from i2i.nn.native.products import linear, product
 
 SIGMA_UNITS = ("cell", "halfwidth")
 _NEGLIGIBLE = torch.finfo(torch.float32).eps ** 2  # of weights that sum to 1
@@ -119,12 +120,12 @@ class SamplingProjector(nn.Module):
     def sample(self, features: Tensor) -> Tensor:
         """Sample a map at the points: (B, C, S, S) -> (B, P, C)."""
         check_map(features, self.map_size)
-        return torch.einsum("bcs,vs->bvc", features.flatten(2), self.sampling)
+        return product(self.sampling, features.flatten(2).mT)
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C, S, S) -> (B, P, out_channels)."""
-        signal = self.linear(self.sample(features))
-        return torch.relu(signal) if self.relu else signal
+        sampled = self.sample(features)
+        return linear(sampled, self.linear.weight, self.linear.bias, relu=self.relu)
 
     def extra_repr(self) -> str:
         """`8×8 -> V16, σ = 0.2 cells, coverage 0.9`."""
