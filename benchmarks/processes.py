@@ -20,6 +20,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from i2i.data.noise import noise_batch
 from i2i.memory import reuse_memory
+from i2i.nn.batch_norm import statistics_are_joint
+from i2i.nn.processes import share_gradients
 from network_speed import network
 
 THREADS = 2
@@ -38,7 +40,9 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     if processes > 1:
         meeting = f"file://{folder}/meeting"
         distributed.init_process_group("gloo", meeting, rank=rank, world_size=processes)
-        model = DistributedDataParallel(model)
+        # As `i2i.tasks` has it.
+        model = DistributedDataParallel(model, broadcast_buffers=not statistics_are_joint(net))
+        share_gradients(model)
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-4, momentum=0.9, nesterov=True)
     seconds, losses = [], []
     for step in range(options.warm_up + options.steps):

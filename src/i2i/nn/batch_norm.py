@@ -6,11 +6,12 @@ does; `torch.nn.SyncBatchNorm` does so too, but refuses tensors of a CPU and kno
 """
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from i2i.nn.precision import at_least_float32
-from i2i.nn.processes import num_processes, sum_over_processes
+from i2i.nn.processes import gather_from_processes, num_processes, sum_over_processes
 
 
 @torch.no_grad()
@@ -66,6 +67,13 @@ class JointBatchNorm2d(_Joint, nn.BatchNorm2d):
     """
 
 
+def statistics_are_joint(module: nn.Module) -> bool:
+    """Whether no batch norm within takes its statistics from its own process's part of a batch."""
+    return not any(
+        isinstance(part, _BatchNorm) and not isinstance(part, _Joint) for part in module.modules()
+    )
+
+
 def _joint_batch_norm(norm: nn.BatchNorm1d | nn.BatchNorm2d, x: Tensor) -> Tensor:
     channels = x.shape[1]
     weight = x.new_ones(channels) if norm.weight is None else norm.weight
@@ -89,9 +97,7 @@ def joint_moments(mean: Tensor, var: Tensor, count: int) -> tuple[Tensor, Tensor
     which keeps the digits that E[x²] − mean² would lose.
     """
     ours = torch.cat([mean.double(), var.double(), mean.new_full((1,), count, dtype=torch.float64)])
-    parts = [torch.empty_like(ours) for _ in range(num_processes())]
-    distributed.all_gather(parts, ours)
-    together = torch.stack(parts)
+    together = gather_from_processes(ours)
     means, variances = together[:, :-1].unflatten(1, (2, -1)).unbind(dim=1)  # (processes, C)
     total = together[:, -1].sum()
     shares = together[:, -1:] / total

@@ -1,7 +1,15 @@
 """What the processes that share a batch (DDP) tell each other."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, distributed
+from torch.nn.parallel import DistributedDataParallel
+
+from i2i.nn.native.exchange import SharedMemory, shared_memory
+
+# The default group that was asked last, and the memory that its processes share.
+_KNOWN: list[tuple[Any, SharedMemory | None]] = [(None, None)]
 
 
 def num_processes() -> int:
@@ -19,8 +27,53 @@ def sum_over_processes(*parts: Tensor) -> tuple[Tensor, ...]:
     """
     packed = torch.cat([part.detach().flatten() for part in parts])
     if num_processes() > 1:
-        distributed.all_reduce(packed)
+        _add_up(packed)
     sizes = [part.numel() for part in parts]
     return tuple(
         flat.view(part.shape) for flat, part in zip(packed.split(sizes), parts, strict=True)
     )
+
+
+def gather_from_processes(tensor: Tensor) -> Tensor:
+    """The tensors of all processes, which have one shape: (processes, *shape); no gradient."""
+    memory = _memory() if tensor.device.type == "cpu" else None
+    if memory is not None:
+        return memory.gather(tensor)
+    parts = [torch.empty_like(tensor) for _ in range(num_processes())]
+    distributed.all_gather(parts, tensor.detach().contiguous())
+    return torch.stack(parts)
+
+
+def share_gradients(model: DistributedDataParallel) -> None:
+    """Let DDP add up gradients through shared memory, where its processes have one.
+
+    All of them have to call it together, before the first backward pass.
+    """
+    if _memory() is not None:
+        model.register_comm_hook(None, _mean_of_bucket)
+
+
+def _mean_of_bucket(_: None, bucket: distributed.GradBucket) -> torch.futures.Future[Tensor]:
+    gradients = bucket.buffer()
+    _add_up(gradients)
+    future: torch.futures.Future[Tensor] = torch.futures.Future()
+    future.set_result(gradients.div_(num_processes()))
+    return future
+
+
+def _add_up(tensor: Tensor) -> None:
+    """Put the sum over all processes in its place."""
+    memory = _memory() if SharedMemory.can_add(tensor) else None
+    if memory is None:
+        distributed.all_reduce(tensor)
+    else:
+        memory.add_up(tensor)
+
+
+def _memory() -> SharedMemory | None:
+    """That of the default group; all processes ask for it together the first time."""
+    group = distributed.group.WORLD
+    if _KNOWN[0][0] is not group:
+        is_local = distributed.get_backend() == "gloo"
+        _KNOWN[0] = (group, shared_memory() if is_local else None)
+    return _KNOWN[0][1]

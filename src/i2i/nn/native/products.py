@@ -86,7 +86,9 @@ def _multiply(
         batch = (count,) if left.ndim == 3 or right.ndim == 3 else ()
         out = left.new_empty(*batch, sizes[0], sizes[2])
     # The one matrix of a side is met again and again: the step to the next is 0.
-    steps = [part.stride() if part.ndim == 3 else (0, *part.stride()) for part in (left, right, out)]
+    steps = [
+        part.stride() if part.ndim == 3 else (0, *part.stride()) for part in (left, right, out)
+    ]
     shape = (count, *sizes, *steps[0], *steps[1], *steps[2][:2])
     functions().i2i_products(
         *map(pointer, (left, right, out, bias)),
