@@ -20,8 +20,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from i2i.data.noise import noise_batch
 from i2i.memory import reuse_memory
-from i2i.nn.batch_norm import statistics_are_joint
-from i2i.nn.processes import share_gradients
+from i2i.nn.data_parallel import share_batch
 from network_speed import network
 
 THREADS = 2
@@ -40,9 +39,8 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     if processes > 1:
         meeting = f"file://{folder}/meeting"
         distributed.init_process_group("gloo", meeting, rank=rank, world_size=processes)
-        # As `i2i.tasks` has it.
-        model = DistributedDataParallel(model, broadcast_buffers=not statistics_are_joint(net))
-        share_gradients(model)
+        model = DistributedDataParallel(model)
+        share_batch(model)
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-4, momentum=0.9, nesterov=True)
     seconds, losses = [], []
     for step in range(options.warm_up + options.steps):
@@ -90,7 +88,7 @@ def main() -> None:
     parser.add_argument("--scale", default="paper")
     parser.add_argument("--batch", type=int, default=64, help="of all processes together")
     parser.add_argument("--steps", type=int, default=5)
-    parser.add_argument("--warm-up", type=int, default=2)
+    parser.add_argument("--warm-up", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
     seconds: dict[int, list[float]] = {1: [], 2: []}

@@ -4,7 +4,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, distributed
-from torch.nn.parallel import DistributedDataParallel
 
 from i2i.nn.native.exchange import SharedMemory, shared_memory
 
@@ -27,7 +26,7 @@ def sum_over_processes(*parts: Tensor) -> tuple[Tensor, ...]:
     """
     packed = torch.cat([part.detach().flatten() for part in parts])
     if num_processes() > 1:
-        _add_up(packed)
+        sum_in_place(packed)
     sizes = [part.numel() for part in parts]
     return tuple(
         flat.view(part.shape) for flat, part in zip(packed.split(sizes), parts, strict=True)
@@ -44,30 +43,18 @@ def gather_from_processes(tensor: Tensor) -> Tensor:
     return torch.stack(parts)
 
 
-def share_gradients(model: DistributedDataParallel) -> None:
-    """Let DDP add up gradients through shared memory, where its processes have one.
-
-    All of them have to call it together, before the first backward pass.
-    """
-    if _memory() is not None:
-        model.register_comm_hook(None, _mean_of_bucket)
-
-
-def _mean_of_bucket(_: None, bucket: distributed.GradBucket) -> torch.futures.Future[Tensor]:
-    gradients = bucket.buffer()
-    _add_up(gradients)
-    future: torch.futures.Future[Tensor] = torch.futures.Future()
-    future.set_result(gradients.div_(num_processes()))
-    return future
-
-
-def _add_up(tensor: Tensor) -> None:
-    """Put the sum over all processes in its place."""
+def sum_in_place(tensor: Tensor) -> None:
+    """Put the sum over all processes in the place of each one's tensor; no gradient passes."""
     memory = _memory() if SharedMemory.can_add(tensor) else None
     if memory is None:
         distributed.all_reduce(tensor)
     else:
         memory.add_up(tensor)
+
+
+def has_shared_memory() -> bool:
+    """Whether processes exchange through memory; the first time all ask together."""
+    return _memory() is not None
 
 
 def _memory() -> SharedMemory | None:

@@ -11,8 +11,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from i2i.data.info import DataInfo
-from i2i.nn.batch_norm import statistics_are_joint
-from i2i.nn.processes import num_processes, share_gradients, sum_over_processes
+from i2i.nn.data_parallel import share_batch
+from i2i.nn.processes import num_processes, sum_over_processes
 
 Batch = dict[str, Tensor]
 
@@ -59,12 +59,9 @@ class Task(LightningModule):
     def on_train_start(self) -> None:
         """Spare processes that share a batch what they need not tell each other slowly."""
         strategy = self.trainer.strategy
-        if not isinstance(strategy.model, DistributedDataParallel):
-            return
-        if getattr(strategy, "_ddp_comm_hook", None) is None:  # the user's own
-            share_gradients(strategy.model)
-        # Statistics that are joint are everywhere the same: the first process's need not be sent.
-        strategy.model.broadcast_buffers &= not statistics_are_joint(self.network)
+        if isinstance(strategy.model, DistributedDataParallel):
+            has_hook = getattr(strategy, "_ddp_comm_hook", None) is not None  # the user's own
+            share_batch(strategy.model, gradients=not has_hook)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one batch, logged with its terms."""
