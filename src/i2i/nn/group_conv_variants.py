@@ -73,12 +73,14 @@ class VectorFilterConv(GroupCorrelation):
         nn.init.uniform_(self.sphere, -bound, bound)
         nn.init.xavier_uniform_(self.bias)
 
-    def products(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
-        """Every vertex of the signal with every vertex of f: (B, H, n) -> (B, m, H, V)."""
+    def sums(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
+        """The correlation without its bias: (B, H, n) -> (B, 60, m)."""
         # (K, V, n, m) -> (K, n, V · m): one product with the signal's rows.
         rows = self.sphere.transpose(1, 2).flatten(2)
-        products = signal @ (rows[0] if self.num_spheres == 1 else rows[sphere_index])
-        return products.unflatten(2, (self.sphere_size, self.out_features)).movedim(3, 1)
+        products = signal @ (rows[0] if sphere_index is None else rows[sphere_index])
+        # (B, H, V · m) -> (B, m, H · V)
+        products = products.unflatten(2, (self.sphere_size, self.out_features)).movedim(3, 1)
+        return self.add_up(products.flatten(2))
 
     def __repr__(self) -> str:
         n, m = self.features, self.out_features

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import MeshAxis, icosahedron
-from i2i.nn.native.products import product
+from i2i.nn.native.correlation import can_correlate, correlate
 from i2i.nn.precision import full_precision
 
 
@@ -14,7 +14,8 @@ class GroupCorrelation(nn.Module):
     `out[b, g, m] = Σ_v Σ_n f[moved[g, v], n] ψ[b, v, n, m] + bias[m]`.
 
     The tensor over elements, places and features is never made: ψ is multiplied with the features
-    of all V places, and a constant 0/1 matrix adds up the right pairs for each of the 60 elements.
+    of all V places, and the right pairs are added up for each of the 60 elements. `native` does it
+    an image at a time; by torch a constant 0/1 matrix adds up.
 
     Args:
         features: Width n of f.
@@ -35,6 +36,7 @@ class GroupCorrelation(nn.Module):
     """
 
     pairs: Tensor
+    moved: Tensor
 
     def __init__(
         self,
@@ -52,6 +54,7 @@ class GroupCorrelation(nn.Module):
         self.sphere = nn.Parameter(torch.empty(num_spheres, num_places, features))
         self.bias = nn.Parameter(torch.empty(num_spheres, out_features))
         self.register_buffer("pairs", _pair_matrix(moved, num_places), persistent=False)
+        self.register_buffer("moved", moved.T.int().contiguous(), persistent=False)  # (H, 60)
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -59,33 +62,29 @@ class GroupCorrelation(nn.Module):
         nn.init.xavier_uniform_(self.sphere)
         nn.init.xavier_uniform_(self.bias)
 
-    def products(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
-        """Every place of the signal with every place of f: (B, H, n · m) -> (B, m, H, V)."""
-        batch = signal.shape[0]
-        psi = signal.reshape(-1, self.features, self.out_features)
-        if self.num_spheres == 1:
-            # (m, B · H, n) with the rows of f: (m, B · H, V).
-            products = product(psi.permute(2, 0, 1), self.sphere[0].T)
-            products = products.view(self.out_features, batch, self.num_vertices, -1)
-            return products.transpose(0, 1)
-        # (B, m · H, n) with the rows of each image's f: (B, m · H, V).
-        psi = psi.view(batch, -1, self.features, self.out_features).permute(0, 3, 1, 2)
-        products = psi.flatten(1, 2) @ self.sphere[sphere_index].transpose(1, 2)
-        return products.view(batch, self.out_features, self.num_vertices, self.sphere_size)
-
     def forward(self, signal: Tensor, sphere_index: Tensor | None = None) -> Tensor:
         """Correlate: (B, H, filter_channels), index (B,) into the spheres or None -> (B, 60, m)."""
         check_signal(signal, (self.num_vertices, self.filter_channels))
         check_index(self.num_spheres, sphere_index)
-        # Entry (v, u) of the last two axes is the product of ψ(v) and f(u).
-        products = self.products(signal, sphere_index).transpose(0, 1)
-        products = products.reshape(-1, len(self.pairs))  # (m · B, H · V)
+        index = None if self.num_spheres == 1 else sphere_index
+        bias = self.bias if index is None else self.bias[index]
+        return self.sums(signal, index) + bias[:, None, :]
+
+    def sums(self, signal: Tensor, sphere_index: Tensor | None) -> Tensor:
+        """The correlation without its bias: (B, H, filter_channels) -> (B, 60, m)."""
+        if can_correlate(signal, self.sphere):
+            return correlate(signal, self.sphere, sphere_index, self.moved)
+        psi = signal.view(len(signal), -1, self.features, self.out_features).permute(0, 3, 1, 2)
+        sphere = self.sphere[0] if sphere_index is None else self.sphere[sphere_index]
+        # (B, m · H, n) with the rows of f: (B, m · H, V).
+        products = psi.flatten(1, 2) @ sphere.mT
+        return self.add_up(products.view(len(signal), self.out_features, -1))
+
+    def add_up(self, products: Tensor) -> Tensor:
+        """Of the products (B, m, H · V) of places those that meet: (B, 60, m)."""
         # Sums of rounded products are kept in full precision: logits differ by little.
         with full_precision(products):
-            out = product(products.to(self.pairs.dtype), self.pairs)
-        bias = self.bias if self.num_spheres == 1 else self.bias[sphere_index]
-        # (m, B, 60) -> (B, 60, m)
-        return out.view(self.out_features, len(signal), -1).permute(1, 2, 0) + bias[:, None, :]
+            return (products.to(self.pairs.dtype) @ self.pairs).transpose(1, 2)
 
 
 class DynamicFilterConv(GroupCorrelation):
