@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from i2i.geometry.icosahedron import icosahedron
+from i2i.nn import native
+from i2i.nn.group_conv_variants import FullGroupConv
 from i2i.nn.group_convs import DynamicFilterConv
 from i2i.nn.projectors import IcosahedralProjector
 from i2i.testing import assert_icosahedral_equivariant, run_oracle
@@ -27,6 +29,7 @@ def direct(conv, mesh, signal, index=None):
 @pytest.mark.parametrize("axis", ["vertex", "twofold"])
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("num_spheres", [1, 3])
+@pytest.mark.usefixtures("both_forms")
 def test_equals_the_written_out_sum(level, num_spheres, axis):
     torch.manual_seed(0)
     conv = DynamicFilterConv(5, 4, num_spheres=num_spheres, mesh_level=level, mesh_axis=axis)
@@ -122,6 +125,63 @@ def test_parameters_and_initial_values():
     bound = (6 / (42 * 128 + 128)) ** 0.5
     assert 0.95 * bound < conv.sphere.abs().max() <= bound
     assert set(conv.state_dict()) == {"sphere", "bias"}
+
+
+def _with_gradients(conv, signal, index, upstream):
+    """What a layer gives, and the gradients of its signal and parameters."""
+    signal = signal.clone().requires_grad_()
+    out = conv(signal, index)
+    return [out.detach(), *torch.autograd.grad(out, [signal, *conv.parameters()], upstream)]
+
+
+@pytest.mark.skipif(native.library() is None, reason="no compiler was found")
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("batch", [1, 5])
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (DynamicFilterConv, {"features": 128, "out_features": 7}),
+        (DynamicFilterConv, {"features": 37, "out_features": 1, "mesh_level": 0}),
+        (DynamicFilterConv, {"features": 48, "out_features": 8, "mesh_level": 2}),
+        (DynamicFilterConv, {"features": 50, "out_features": 40, "num_spheres": 3}),
+        (FullGroupConv, {"features": 20, "out_features": 9, "support": "local13"}),
+        (FullGroupConv, {"features": 20, "out_features": 2, "num_spheres": 2}),
+    ],
+)
+def test_the_compiled_sums_and_their_gradients_are_those_of_torch(
+    kind, options, batch, dtype, tolerance
+):
+    torch.manual_seed(0)
+    conv = kind(**options).to(dtype)
+    signal = torch.randn(batch, conv.num_vertices, conv.filter_channels, dtype=dtype)
+    upstream = torch.randn(batch, 60, conv.out_features, dtype=dtype)
+    index = torch.arange(batch) % conv.num_spheres if conv.num_spheres > 1 else None
+    ours = _with_gradients(conv, signal, index, upstream)
+    with native.torch_only():
+        theirs = _with_gradients(conv, signal, index, upstream)
+    for value, reference in zip(ours, theirs, strict=True):
+        assert value.shape == reference.shape
+        assert ((value - reference).norm() / reference.norm()).item() < tolerance
+
+
+@pytest.mark.usefixtures("both_forms")
+def test_a_signal_of_any_strides_and_what_is_not_a_number():
+    torch.manual_seed(0)
+    conv = DynamicFilterConv(5, 3).double()
+    wide = torch.randn(2, conv.num_vertices, 30, dtype=torch.float64)
+    with torch.no_grad():
+        torch.testing.assert_close(conv(wide[..., ::2]), conv(wide[..., ::2].contiguous()))
+        wide[1, 3, 4] = float("nan")
+        out = conv(wide[..., ::2])
+    assert not out[0].isnan().any()
+    assert out[1].isnan().any()
+
+
+@pytest.mark.usefixtures("both_forms")
+def test_an_index_without_a_sphere_is_refused():
+    conv = DynamicFilterConv(2, 3, num_spheres=2)
+    with pytest.raises(IndexError):
+        conv(torch.zeros(1, 16, 6), torch.tensor([2]))
 
 
 def test_channel_order_is_output_fastest():

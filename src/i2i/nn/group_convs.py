@@ -74,7 +74,7 @@ class GroupCorrelation(nn.Module):
         """The correlation without its bias: (B, H, filter_channels) -> (B, 60, m)."""
         if can_correlate(signal, self.sphere):
             return correlate(signal, self.sphere, sphere_index, self.moved)
-        psi = signal.view(len(signal), -1, self.features, self.out_features).permute(0, 3, 1, 2)
+        psi = signal.reshape(len(signal), -1, self.features, self.out_features).permute(0, 3, 1, 2)
         sphere = self.sphere[0] if sphere_index is None else self.sphere[sphere_index]
         # (B, m · H, n) with the rows of f: (B, m · H, V).
         products = psi.flatten(1, 2) @ sphere.mT

@@ -56,7 +56,7 @@ class _Correlate(torch.autograd.Function):
         functions().i2i_correlate(
             *map(pointer, (signal, spheres, index, moved, out)), *_sizes(signal, spheres, moved)
         )
-        ctx.save_for_backward(signal, spheres, index, moved)
+        ctx.save_for_backward(signal, spheres, index, moved)  # type: ignore[arg-type]
         return out
 
     @staticmethod
