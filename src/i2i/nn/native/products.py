@@ -78,13 +78,16 @@ def _multiply(
     bias: Tensor | None = None,
     relu: bool = False,
 ) -> Tensor:
-    count = max(len(part) if part.ndim == 3 else 1 for part in (left, right))
+    batches = {len(part) for part in (left, right) if part.ndim == 3}
+    if left.shape[-1] != right.shape[-2] or len(batches) > 1:
+        raise ValueError(f"no product of {tuple(left.shape)} and {tuple(right.shape)}")
     sizes = (*left.shape[-2:], right.shape[-1])
-    if left.shape[-1] != right.shape[-2]:
-        raise ValueError(f"a product of {tuple(left.shape)} and {tuple(right.shape)}")
+    expected = (*batches, sizes[0], sizes[2])
     if out is None:
-        batch = (count,) if left.ndim == 3 or right.ndim == 3 else ()
-        out = left.new_empty(*batch, sizes[0], sizes[2])
+        out = left.new_empty(expected)
+    elif out.shape != expected or out.dtype != left.dtype or out.stride(-1) != 1:
+        raise ValueError(f"expected out of shape {expected} with rows of {left.dtype}")
+    count = out.shape[0] if batches else 1
     # The one matrix of a side is met again and again: the step to the next is 0.
     steps = [
         part.stride() if part.ndim == 3 else (0, *part.stride()) for part in (left, right, out)
