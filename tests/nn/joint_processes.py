@@ -36,16 +36,16 @@ class PixelMajor(nn.Module):
         return out.permute(3, 0, 1, 2)
 
 
-def in_processes(work, folder: Path, *given) -> list:
-    """What `work(rank, *given)` returns in each of two processes that share a group."""
-    torch.multiprocessing.spawn(_run, args=(work, str(folder), given), nprocs=PROCESSES)
-    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(PROCESSES)]
+def in_processes(work, folder: Path, *given, processes: int = PROCESSES) -> list:
+    """What `work(rank, *given)` returns in each of a few processes that share a group."""
+    torch.multiprocessing.spawn(_run, args=(processes, work, str(folder), given), nprocs=processes)
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(processes)]
 
 
-def _run(rank: int, work, folder: str, given: tuple) -> None:
+def _run(rank: int, processes: int, work, folder: str, given: tuple) -> None:
     torch.set_num_threads(1)
     distributed.init_process_group(
-        "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=PROCESSES
+        "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=processes
     )
     torch.save(work(rank, *given), Path(folder) / f"{rank}.pt")
     distributed.destroy_process_group()
