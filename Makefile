@@ -43,7 +43,7 @@ table: $(VENV)/.installed
 	$(PY) -m i2i.runs.results results "consistent labels"
 
 bench: $(VENV)/.installed
-	for name in parameter_counts oracle c4_spectral network_speed floor processes training_memory predict_rate render_rate loader_rate scaling; do \
+	for name in parameter_counts oracle c4_spectral network_speed floor processes training_course training_memory predict_rate render_rate loader_rate scaling; do \
 		$(PY) benchmarks/$$name.py || exit 1; done
 
 clean:

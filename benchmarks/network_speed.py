@@ -19,7 +19,7 @@ import platform
 import resource
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +174,16 @@ def building(scale: str) -> Timings:
     }
 
 
+def processor() -> str:
+    """Its name where the system tells it, else its kind."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.machine()
+
+
 def measure(options: argparse.Namespace) -> dict[str, Timings]:
     """All parts that were asked for, by title."""
     scale, device, repeats, size = options.scale, options.device, options.repeats, options.batch
@@ -262,7 +272,7 @@ def main() -> None:
     name = options.name or f"network_speed_{options.scale}{ending}"
     file = RESULTS / f"{name}.json"
     machine = {
-        "processor": platform.machine(),
+        "processor": processor(),
         "torch": torch.__version__,
         "threads": options.threads,
         "capability": torch.backends.cpu.get_cpu_capability(),
