@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
+#include <utility>
 #include <vector>
 
 #include "lanes.h"
@@ -115,13 +116,58 @@ void tile(const T* a, int64_t row_step, const T* b, int64_t depth, T* c, int64_t
   }
 }
 
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define I2I_HAS_SHUFFLES
+#endif
+#endif
+
+#if defined(I2I_HAS_SHUFFLES)
+// The lower or upper halves of two vectors, one number of each in turn.
+template <class V, size_t... lane>
+V in_turn(V first, V second, bool upper, std::index_sequence<lane...>) {
+  constexpr int size = sizeof...(lane);
+  if (upper) {
+    return __builtin_shufflevector(first, second, (size / 2 + lane / 2 + lane % 2 * size)...);
+  }
+  return __builtin_shufflevector(first, second, (lane / 2 + lane % 2 * size)...);
+}
+
+// Columns that lie one after the other in memory, `step` apart, to rows `width` apart; a vector each.
+template <class T>
+void turn_over(const T* from, int64_t step, T* to, int64_t width) {
+  constexpr int size = Lane<T>::size;
+  const auto lanes = std::make_index_sequence<size>();
+  typename Lane<T>::Vec now[size], next[size];
+  for (int i = 0; i < size; ++i) now[i] = load_one<T>(from + i * step, size);
+#pragma GCC unroll 4
+  for (int done = 1; done < size; done *= 2) {
+#pragma GCC unroll 8
+    for (int i = 0; i < size / 2; ++i) {
+      next[2 * i] = in_turn(now[i], now[i + size / 2], false, lanes);
+      next[2 * i + 1] = in_turn(now[i], now[i + size / 2], true, lanes);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < size; ++i) now[i] = next[i];
+  }
+  for (int i = 0; i < size; ++i) store_one<T>(to + i * width, size, now[i]);
+}
+#endif
+
 // Columns of b as tiles want them: (tile, k, column), filled up with zeros.
 template <class T>
 void order_right(const Matrix<T>& b, int64_t depth, int64_t columns, T* to) {
   constexpr int width = kTileColumns<T>;
   for (int64_t j = 0; j < columns; j += width) {
     const int count = static_cast<int>(std::min<int64_t>(width, columns - j));
-    for (int64_t k = 0; k < depth; ++k, to += width) {
+    int64_t k = 0;
+#if defined(I2I_HAS_SHUFFLES)
+    constexpr int size = Lane<T>::size;
+    for (; b.row == 1 && count == width && k + size <= depth; k += size, to += size * width) {
+      for (int c = 0; c < width; c += size) turn_over(b.at(k, j + c), b.column, to + c, width);
+    }
+#endif
+    for (; k < depth; ++k, to += width) {
       const T* from = b.at(k, j);
       if (b.column == 1) {
         std::copy(from, from + count, to);
@@ -189,6 +235,13 @@ void rows_of(const Matrix<T>& a, const T* b, int64_t depth, int64_t rows, int64_
       const int count = static_cast<int>(std::min<int64_t>(kTileRows, some - r));
       T* to = c + (i + r) * pitch;
       if (as_it_is) {
+        // A new row is far from the last one: a processor does not see it coming.
+        for (int64_t next = 0; next < kTileRows; ++next) {
+          const T* row = a.at(i + r + kTileRows + next, 0);
+          for (int64_t k = 0; k < depth; k += kLineBytes / sizeof(T)) {
+            __builtin_prefetch(row + k, 0, 2);
+          }
+        }
         tiles_of_rows<T, false>(a.at(i + r, 0), a.row, b, depth, count, columns, to, pitch,
                                 finish);
       } else {
