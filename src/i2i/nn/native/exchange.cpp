@@ -75,8 +75,6 @@ void sum(const Room& room, uint64_t turn, T* to, int64_t count) {
 
 extern "C" {
 
-int64_t i2i_exchange_size(int64_t ranks, int64_t slot) { return ranks * (kLineBytes + 2 * slot); }
-
 // Writes `ours` unless it is null: then an earlier call had to give up waiting. `theirs` becomes all
 // ranks' bytes one after the other, or, `of` 1 or 2, the sum of their floats or doubles.
 // Returns 0, or 1 + the rank that did not come within `patience` seconds.
