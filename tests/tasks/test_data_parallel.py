@@ -12,9 +12,7 @@ from i2i.tasks.base import Task
 
 
 def _begin(model, **strategy):
-    task = Task(
-        nn.Identity(), optimizer=None, scheduler=None, scheduler_interval="step", info=None
-    )
+    task = Task(nn.Identity(), optimizer=None, scheduler=None, scheduler_interval="step", info=None)
     task.trainer = SimpleNamespace(strategy=SimpleNamespace(model=model, **strategy))
     task.on_train_start()
 
