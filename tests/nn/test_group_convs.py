@@ -1,5 +1,9 @@
 """The icosahedral correlation against the written-out sum, its symmetries, and the oracle."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -7,8 +11,13 @@ from i2i.geometry.icosahedron import icosahedron
 from i2i.nn import native
 from i2i.nn.group_conv_variants import FullGroupConv
 from i2i.nn.group_convs import DynamicFilterConv
+from i2i.nn.native.correlation import correlate
 from i2i.nn.projectors import IcosahedralProjector
 from i2i.testing import assert_icosahedral_equivariant, run_oracle
+
+needs_library = pytest.mark.skipif(
+    native.library() is None and "I2I_EXPECT" not in os.environ, reason="no compiler was found"
+)
 
 
 def direct(conv, mesh, signal, index=None):
@@ -134,7 +143,7 @@ def _with_gradients(conv, signal, index, upstream):
     return [out.detach(), *torch.autograd.grad(out, [signal, *conv.parameters()], upstream)]
 
 
-@pytest.mark.skipif(native.library() is None, reason="no compiler was found")
+@needs_library
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("batch", [1, 5])
 @pytest.mark.parametrize(
@@ -177,11 +186,57 @@ def test_a_signal_of_any_strides_and_what_is_not_a_number():
     assert out[1].isnan().any()
 
 
+@needs_library
+@pytest.mark.parametrize("turn", [torch.Tensor.expand_as, lambda x, like: like.mT.contiguous().mT])
+def test_upstream_gradients_of_any_strides(turn):
+    """They are copied for the call, and the copy has to last until it is over."""
+    torch.manual_seed(0)
+    conv = DynamicFilterConv(64, 7).double()
+    signal = torch.randn(20, 16, conv.filter_channels, dtype=torch.float64)
+    upstream = turn(torch.ones(1, dtype=torch.float64), torch.randn(20, 60, 7).double())
+    assert not upstream.is_contiguous()
+    ours = _with_gradients(conv, signal, None, upstream)
+    with native.torch_only():
+        theirs = _with_gradients(conv, signal, None, upstream)
+    torch.testing.assert_close(ours, theirs, atol=1e-11, rtol=1e-11)
+
+
 @pytest.mark.usefixtures("both_forms")
-def test_an_index_without_a_sphere_is_refused():
+@pytest.mark.parametrize("index", [torch.tensor([1, 0, 1], dtype=torch.int32), torch.tensor([1])])
+def test_an_index_of_another_type_or_for_all_images(index):
+    conv = DynamicFilterConv(5, 4, num_spheres=2).double()
+    signal = torch.randn(3, 16, 20, dtype=torch.float64)
+    expected = conv(signal, index.long().expand(3))
+    torch.testing.assert_close(conv(signal, index), expected)
+
+
+@needs_library
+@pytest.mark.parametrize("index", [[2, 0], [-1, 0]])
+def test_an_index_without_a_sphere_is_refused(index):
     conv = DynamicFilterConv(2, 3, num_spheres=2)
-    with pytest.raises(IndexError):
-        conv(torch.zeros(1, 16, 6), torch.tensor([2]))
+    with pytest.raises(IndexError, match="spheres 0 to 1"):
+        correlate(torch.zeros(2, 16, 6), conv.sphere, torch.tensor(index), conv.moved)
+    with pytest.raises(RuntimeError):
+        correlate(torch.zeros(2, 16, 6), conv.sphere, torch.tensor([0, 0, 0]), conv.moved)
+
+
+@needs_library
+def test_the_library_for_avx2_correlates_too():
+    if torch.backends.cpu.get_cpu_capability() != "AVX512":
+        pytest.skip("the library for AVX2 is the one that the other tests take, or there is none")
+    subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", __file__],
+        env={**os.environ, "ATEN_CPU_CAPABILITY": "avx2", "I2I_EXPECT": "avx2"}, check=True,
+    )  # fmt: skip
+
+
+def test_transforms_of_functions_pass_through():
+    """`torch.func` takes torch's form."""
+    conv = DynamicFilterConv(3, 2).double()
+    signal = torch.randn(2, 16, 6, dtype=torch.float64, requires_grad=True)
+    of_sum = torch.func.grad(lambda x: conv(x).square().sum())(signal)
+    (expected,) = torch.autograd.grad(conv(signal).square().sum(), signal)
+    torch.testing.assert_close(of_sum, expected)
 
 
 def test_channel_order_is_output_fastest():

@@ -73,7 +73,7 @@ def test_sampling_commutes_with_the_linear_map():
     direct = torch.einsum("boij,vij->bvo", mapped, projector.sampling.view(16, 8, 8)).relu()
     torch.testing.assert_close(projector(features), direct, atol=1e-5, rtol=1e-5)
     assert (projector(features) >= 0).all()
-    projector.relu = False
+    projector.linear.relu = False
     assert (projector(features) < 0).any()
 
 

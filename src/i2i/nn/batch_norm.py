@@ -8,7 +8,7 @@ does; `torch.nn.SyncBatchNorm` does so too, but refuses tensors of a CPU and kno
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx, once_differentiable
-from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.batchnorm import _NormBase
 
 from i2i.nn.precision import at_least_float32
 from i2i.nn.processes import gather_from_processes, num_processes, sum_over_processes
@@ -68,9 +68,9 @@ class JointBatchNorm2d(_Joint, nn.BatchNorm2d):
 
 
 def statistics_are_joint(module: nn.Module) -> bool:
-    """Whether no batch norm within takes its statistics from its own process's part of a batch."""
+    """Whether no norm within keeps statistics of its own process's part of a batch."""
     return not any(
-        isinstance(part, _BatchNorm) and not isinstance(part, _Joint) for part in module.modules()
+        isinstance(part, _NormBase) and not isinstance(part, _Joint) for part in module.modules()
     )
 
 

@@ -74,11 +74,13 @@ class GroupCorrelation(nn.Module):
         """The correlation without its bias: (B, H, filter_channels) -> (B, 60, m)."""
         if can_correlate(signal, self.sphere):
             return correlate(signal, self.sphere, sphere_index, self.moved)
-        psi = signal.reshape(len(signal), -1, self.features, self.out_features).permute(0, 3, 1, 2)
+        psi = signal.reshape(signal.shape[0], -1, self.features, self.out_features).permute(
+            0, 3, 1, 2
+        )
         sphere = self.sphere[0] if sphere_index is None else self.sphere[sphere_index]
         # (B, m · H, n) with the rows of f: (B, m · H, V).
         products = psi.flatten(1, 2) @ sphere.mT
-        return self.add_up(products.view(len(signal), self.out_features, -1))
+        return self.add_up(products.view(signal.shape[0], self.out_features, -1))
 
     def add_up(self, products: Tensor) -> Tensor:
         """Of the products (B, m, H · V) of places those that meet: (B, 60, m)."""

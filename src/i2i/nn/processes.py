@@ -38,8 +38,9 @@ def gather_from_processes(tensor: Tensor) -> Tensor:
     memory = _memory() if tensor.device.type == "cpu" else None
     if memory is not None:
         return memory.gather(tensor)
-    parts = [torch.empty_like(tensor) for _ in range(num_processes())]
-    distributed.all_gather(parts, tensor.detach().contiguous())
+    ours = tensor.detach().contiguous()
+    parts = [torch.empty_like(ours) for _ in range(num_processes())]
+    distributed.all_gather(parts, ours)
     return torch.stack(parts)
 
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from i2i.geometry.icosahedron import MeshAxis, icosahedron
 from i2i.nn.group_conv_variants import READINGS, support_elements
-from i2i.nn.native.products import linear, product
+from i2i.nn.native.products import Linear, product
 
 SIGMA_UNITS = ("cell", "halfwidth")
 _NEGLIGIBLE = torch.finfo(torch.float32).eps ** 2  # of weights that sum to 1
@@ -114,8 +114,7 @@ class SamplingProjector(nn.Module):
         weights = sampling_weights(positions, map_size, self.sigma_cells)
         self.register_buffer("sampling", weights.float(), persistent=False)
         self.num_vertices, self.map_size, self.coverage = len(points), map_size, coverage
-        self.linear = nn.Linear(in_channels, out_channels)
-        self.relu = relu
+        self.linear = Linear(in_channels, out_channels, relu=relu)
 
     def sample(self, features: Tensor) -> Tensor:
         """Sample a map at the points: (B, C, S, S) -> (B, P, C)."""
@@ -124,8 +123,8 @@ class SamplingProjector(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C, S, S) -> (B, P, out_channels)."""
-        sampled = self.sample(features)
-        return linear(sampled, self.linear.weight, self.linear.bias, relu=self.relu)
+        signal: Tensor = self.linear(self.sample(features))
+        return signal
 
     def extra_repr(self) -> str:
         """`8×8 -> V16, σ = 0.2 cells, coverage 0.9`."""

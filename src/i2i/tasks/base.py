@@ -58,10 +58,9 @@ class Task(LightningModule):
 
     def on_train_start(self) -> None:
         """Spare processes that share a batch what they need not tell each other slowly."""
-        strategy = self.trainer.strategy
-        if isinstance(strategy.model, DistributedDataParallel):
-            has_hook = getattr(strategy, "_ddp_comm_hook", None) is not None  # the user's own
-            share_batch(strategy.model, gradients=not has_hook)
+        model = self.trainer.strategy.model
+        if isinstance(model, DistributedDataParallel):
+            share_batch(model)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one batch, logged with its terms."""

@@ -69,8 +69,10 @@ def torch_only() -> Iterator[None]:
 
 
 def is_traced() -> bool:
-    """Whether a compiler or tracer is watching."""
-    return torch.compiler.is_compiling() or torch.jit.is_tracing()
+    """Whether a compiler, a tracer or a transform of `torch.func` is watching."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return True
+    return bool(torch._C._are_functorch_transforms_active())  # torch has no public question
 
 
 def is_built_for(tensor: Tensor, dtype: torch.dtype) -> bool:
@@ -79,12 +81,12 @@ def is_built_for(tensor: Tensor, dtype: torch.dtype) -> bool:
     Not what a tracer or compiler watches: it would not see what is written.
     """
     return (
-        _ENABLED[0]
+        not is_traced()  # first: what follows would make a traced size a constant
+        and _ENABLED[0]
         and tensor.device.type == "cpu"
         and (tensor.dtype, dtype) in _TYPES
         and tensor.numel() > 0
         and type(tensor) in (Tensor, torch.nn.Parameter)
-        and not is_traced()
         and library() is not None
     )
 

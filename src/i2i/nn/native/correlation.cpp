@@ -212,14 +212,17 @@ void backward(const T* grad, const T* signal, const T* spheres, const int64_t* i
   const Correlation<T> correlation(shape, moved);
   const int64_t deep = correlation.deep, of_sphere = shape.places * deep;
   Ring<T> wide = filled_up(spheres, shape, deep, false);
+  const int parts = static_cast<int>(std::min<int64_t>(threads, shape.batch));
   std::vector<Ring<T>> totals;
-  for (int part = 0; part < threads; ++part) totals.emplace_back(shape.spheres, of_sphere);
+  for (int part = 0; of_spheres && part < parts; ++part) {
+    totals.emplace_back(shape.spheres, of_sphere);
+  }
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part) {
+  for (int part = 0; part < parts; ++part) {
     Ring<T> upstream(1, correlation.rows() * correlation.wide);
     Ring<T> turned(1, correlation.rows() * deep);
-    const int64_t end = shape.batch * (part + 1) / threads;
-    for (int64_t b = shape.batch * part / threads; b < end; ++b) {
+    const int64_t end = shape.batch * (part + 1) / parts;
+    for (int64_t b = shape.batch * part / parts; b < end; ++b) {
       const int64_t which = index ? index[b] : 0, at = b * correlation.of_signal();
       correlation.of_products(grad + b * correlation.of_out(), upstream.first());
       if (of_signal) {

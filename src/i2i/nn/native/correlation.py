@@ -29,7 +29,7 @@ def correlate(signal: Tensor, spheres: Tensor, index: Tensor | None, moved: Tens
     Args:
         signal: (B, H, n · m), channel `i · m + j`.
         spheres: (S, V, n).
-        index: (B,), int64, into the spheres; None takes the first.
+        index: (B,), or one for all, into the spheres; None takes the first.
         moved: (H, elements), int32: the place of the sphere that an element puts against each v.
 
     Returns:
@@ -38,8 +38,10 @@ def correlate(signal: Tensor, spheres: Tensor, index: Tensor | None, moved: Tens
     Raises:
         IndexError: If an index has no sphere.
     """
-    if index is not None and not 0 <= int(index.min()) <= int(index.max()) < len(spheres):
-        raise IndexError(f"spheres 0 to {len(spheres) - 1}, got the index {index.tolist()}")
+    if index is not None:
+        index = index.long().expand(len(signal))
+        if not 0 <= int(index.min()) <= int(index.max()) < len(spheres):
+            raise IndexError(f"spheres 0 to {len(spheres) - 1}, got the index {index.tolist()}")
     out: Tensor = _Correlate.apply(signal, spheres, index, moved)
     return out
 
@@ -66,10 +68,9 @@ class _Correlate(torch.autograd.Function):
         wants_signal, wants_spheres, *_ = ctx.needs_input_grad  # type: ignore[attr-defined]
         of_signal = torch.empty_like(signal) if wants_signal else None
         of_spheres = torch.zeros_like(spheres) if wants_spheres else None
+        grad = grad.contiguous()  # with a name: it has to last until the call is over
         functions().i2i_correlate_backward(
-            *map(
-                pointer, (grad.contiguous(), signal, spheres, index, moved, of_signal, of_spheres)
-            ),
+            *map(pointer, (grad, signal, spheres, index, moved, of_signal, of_spheres)),
             *_sizes(signal, spheres, moved),
         )
         return of_signal, of_spheres, None, None

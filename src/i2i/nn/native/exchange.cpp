@@ -20,8 +20,14 @@ namespace {
 
 using namespace i2i;
 
-typedef std::atomic<uint64_t> Counter;
-static_assert(Counter::is_always_lock_free && sizeof(Counter) <= kLineBytes, "shared counters");
+// The last turn that a process has written, and what it wrote then: all have to write the same kind.
+struct Written {
+  std::atomic<uint64_t> turn;
+  int64_t kinds[2];  // of the two slots
+};
+static_assert(std::atomic<uint64_t>::is_always_lock_free && sizeof(Written) <= kLineBytes,
+              "shared counters");
+constexpr int kOutOfStep = -1;
 
 constexpr int kSpins = 256;            // between two looks at the clock
 constexpr double kEager = 1e-3;        // seconds before the processor is left to others
@@ -37,15 +43,15 @@ double seconds() {
 struct Room {
   char* memory;
   int64_t ranks, size;  // of a slot
-  Counter& counter(int64_t rank) const {
-    return *reinterpret_cast<Counter*>(memory + rank * kLineBytes);
+  Written& written(int64_t rank) const {
+    return *reinterpret_cast<Written*>(memory + rank * kLineBytes);
   }
   char* slot(uint64_t turn, int64_t rank) const {
     return memory + ranks * kLineBytes + ((turn % 2) * ranks + rank) * size;
   }
 };
 
-bool wait_for(const Counter& counter, uint64_t turn, double until, double start) {
+bool wait_for(const std::atomic<uint64_t>& counter, uint64_t turn, double until, double start) {
   while (true) {
     for (int spin = 0; spin < kSpins; ++spin) {
       if (counter.load(std::memory_order_acquire) >= turn) return true;
@@ -77,19 +83,22 @@ extern "C" {
 
 // Writes `ours` unless it is null: then an earlier call had to give up waiting. `theirs` becomes all
 // ranks' bytes one after the other, or, `of` 1 or 2, the sum of their floats or doubles.
-// Returns 0, or 1 + the rank that did not come within `patience` seconds.
+// Returns 0, 1 + the rank that did not come within `patience` seconds, or kOutOfStep.
 int i2i_exchange(void* memory, int64_t rank, int64_t ranks, int64_t slot, uint64_t turn,
                  const void* ours, void* theirs, int64_t bytes, int of, double patience) {
   const Room room{static_cast<char*>(memory), ranks, slot};
+  const int64_t kind = 4 * bytes + of;
   if (ours) {
     std::memcpy(room.slot(turn, rank), ours, bytes);
-    room.counter(rank).store(turn, std::memory_order_release);
+    room.written(rank).kinds[turn % 2] = kind;
+    room.written(rank).turn.store(turn, std::memory_order_release);
   }
   const double start = seconds();
   for (int64_t other = 0; other < ranks; ++other) {
-    if (!wait_for(room.counter(other), turn, start + patience, start)) {
+    if (!wait_for(room.written(other).turn, turn, start + patience, start)) {
       return static_cast<int>(1 + other);
     }
+    if (room.written(other).kinds[turn % 2] != kind) return kOutOfStep;
   }
   if (of == 1) {
     sum(room, turn, as<float>(theirs), bytes / sizeof(float));

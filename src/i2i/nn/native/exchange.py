@@ -11,7 +11,9 @@ import ctypes
 import mmap
 import os
 import tempfile
+import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, distributed
@@ -21,6 +23,7 @@ from i2i.nn.native import functions, library, pointer
 _FOLDER = Path("/dev/shm")  # memory, as a folder
 _SLOT_BYTES = 1 << 20
 _PATIENCE_SECONDS = 2.0  # after which it is asked whether the other process lives
+_TIMEOUT_SECONDS = 1800.0  # after which one that lives is given up, as torch's groups do
 _SUMS = {torch.float32: 1, torch.float64: 2}
 
 
@@ -40,14 +43,15 @@ class SharedMemory:
     @staticmethod
     def size_for(processes: int) -> int:
         """Bytes that so many processes share."""
-        return processes * (64 + 2 * _SLOT_BYTES)
+        return processes * (64 + 2 * _SLOT_BYTES)  # a line for each counter
 
     def gather(self, tensor: Tensor) -> Tensor:
         """The tensors of all processes, (processes, *shape)."""
         ours = tensor.detach().contiguous().flatten()
-        parts = [ours.new_empty(len(self._pids), len(some)) for some in _pieces(ours)]
-        for some, part in zip(_pieces(ours), parts, strict=True):
-            self._exchange(some, part, 0)
+        parts = [ours.new_empty(len(self._pids), 0)]
+        for some in _pieces(ours):
+            parts.append(ours.new_empty(len(self._pids), len(some)))
+            self._exchange(some, parts[-1], 0)
         return torch.cat(parts, dim=1).view(len(self._pids), *tensor.shape)
 
     def add_up(self, tensor: Tensor) -> None:
@@ -63,6 +67,7 @@ class SharedMemory:
     def _exchange(self, ours: Tensor, theirs: Tensor, of: int) -> None:
         self._turn += 1
         written: Tensor | None = ours
+        give_up = time.monotonic() + _TIMEOUT_SECONDS
         while True:
             late = functions().i2i_exchange(
                 ctypes.c_void_p(self._at),
@@ -75,12 +80,17 @@ class SharedMemory:
             )
             if not late:
                 return
-            written = None
-            if not _is_alive(self._pids[late - 1]):
+            if late < 0:
                 raise RuntimeError(
-                    f"process {late - 1} of {len(self._pids)}, which shares the batch, has ended: "
-                    "its own message says why"
+                    "the processes that share the batch are out of step: one of them has left out "
+                    "a batch, or computes with another network"
                 )
+            written = None
+            name = f"process {late - 1} of {len(self._pids)}, which shares the batch,"
+            if not _is_alive(self._pids[late - 1]):
+                raise RuntimeError(f"{name} has ended: its own message says why")
+            if time.monotonic() > give_up:
+                raise RuntimeError(f"{name} did not answer for {_TIMEOUT_SECONDS / 60:.0f} minutes")
 
 
 def shared_memory() -> SharedMemory | None:
@@ -89,16 +99,20 @@ def shared_memory() -> SharedMemory | None:
     All of them have to call it together.
     """
     path = _offered() if distributed.get_rank() == 0 else None
-    offer = [None if path is None else str(path)]
-    distributed.broadcast_object_list(offer, src=0)
-    memory = _mapped(offer[0])
-    answers: list[tuple[bool, int]] = [(False, 0)] * distributed.get_world_size()
-    distributed.all_gather_object(answers, (memory is not None, os.getpid()))
-    if path is not None:
-        path.unlink()  # the memory lasts as long as somebody has it
-    if memory is None or not all(is_mapped for is_mapped, _ in answers):
+    try:
+        offer = [None if path is None else str(path)]
+        distributed.broadcast_object_list(offer, src=0)
+        memory = _mapped(offer[0])
+        answers: list[Any] = [None] * distributed.get_world_size()
+        distributed.all_gather_object(answers, (memory is not None, _namespace(), os.getpid()))
+    finally:
+        if path is not None:
+            path.unlink()  # the memory lasts as long as somebody has it
+    # Processes that cannot see each other could not tell whether the others live.
+    are_together = len({namespace for _, namespace, _ in answers}) == 1
+    if memory is None or not are_together or not all(is_mapped for is_mapped, *_ in answers):
         return None
-    return SharedMemory(memory, [pid for _, pid in answers])
+    return SharedMemory(memory, [pid for *_, pid in answers])
 
 
 def _offered() -> Path | None:
@@ -128,7 +142,14 @@ def _mapped(name: str | None) -> mmap.mmap | None:
 
 def _pieces(flat: Tensor) -> tuple[Tensor, ...]:
     """Parts of a tensor that fit into a slot."""
-    return flat.split(_SLOT_BYTES // flat.element_size())
+    return flat.split(_SLOT_BYTES // flat.element_size()) if flat.numel() else ()
+
+
+def _namespace() -> str:
+    """In which process numbers mean the same."""
+    with contextlib.suppress(OSError):
+        return str(Path("/proc/self/ns/pid").readlink())
+    return f"unknown of {os.getpid()}"
 
 
 def _is_alive(pid: int) -> bool:
