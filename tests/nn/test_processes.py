@@ -181,7 +181,6 @@ def keeps_a_group(rank, folder):
     return is_kept
 
 
-@pytest.mark.xfail(strict=True, reason="i2i.nn.processes._KNOWN keeps the last group")
 def test_no_group_is_kept_beyond_its_end(tmp_path):
     """Its threads would abort the process, now and then, when that exits."""
     assert in_processes(keeps_a_group, tmp_path, str(tmp_path)) == [False, False]

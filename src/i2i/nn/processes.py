@@ -1,5 +1,7 @@
 """What the processes that share a batch (DDP) tell each other."""
 
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -7,8 +9,9 @@ from torch import Tensor, distributed
 
 from i2i.nn.native.exchange import SharedMemory, shared_memory
 
-# The default group that was asked last, and the memory that its processes share.
-_KNOWN: list[tuple[Any, SharedMemory | None]] = [(None, None)]
+# The default group that was asked last, and the memory that its processes share. A group that was
+# held beyond its end would now and then abort the process when that exits.
+_KNOWN: list[tuple[Callable[[], Any], SharedMemory | None]] = [(lambda: None, None)]
 
 
 def num_processes() -> int:
@@ -61,7 +64,7 @@ def has_shared_memory() -> bool:
 def _memory() -> SharedMemory | None:
     """That of the default group; all processes ask for it together the first time."""
     group = distributed.group.WORLD
-    if _KNOWN[0][0] is not group:
+    if _KNOWN[0][0]() is not group:
         is_local = distributed.get_backend() == "gloo"
-        _KNOWN[0] = (group, shared_memory() if is_local else None)
+        _KNOWN[0] = (weakref.ref(group), shared_memory() if is_local else None)
     return _KNOWN[0][1]
