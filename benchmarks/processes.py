@@ -44,8 +44,7 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-4, momentum=0.9, nesterov=True)
     seconds, losses = [], []
     for step in range(options.warm_up + options.steps):
-        torch.manual_seed(step)
-        joint = noise_batch(info, options.batch)
+        joint = noise_batch(info, options.batch, seed=step)
         batch = {name: value.chunk(processes)[rank] for name, value in joint.items()}
         if processes > 1:
             distributed.barrier()
