@@ -1,11 +1,10 @@
 """The icosahedral correlation against the written-out sum, its symmetries, and the oracle."""
 
 import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from avx2_run import run_with_avx2
 
 from i2i.geometry.icosahedron import icosahedron
 from i2i.nn import native
@@ -222,12 +221,7 @@ def test_an_index_without_a_sphere_is_refused(index):
 
 @needs_library
 def test_the_library_for_avx2_correlates_too():
-    if torch.backends.cpu.get_cpu_capability() != "AVX512":
-        pytest.skip("the library for AVX2 is the one that the other tests take, or there is none")
-    subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n", "0", __file__],
-        env={**os.environ, "ATEN_CPU_CAPABILITY": "avx2", "I2I_EXPECT": "avx2"}, check=True,
-    )  # fmt: skip
+    run_with_avx2(__file__)
 
 
 def test_transforms_of_functions_pass_through():

@@ -4,11 +4,10 @@ import copy
 import math
 import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 import torch
+from avx2_run import run_with_avx2
 from torch import Tensor
 
 from i2i.nn import native
@@ -311,13 +310,7 @@ def test_threads_do_not_change_the_result():
 @needs_library
 def test_the_library_for_avx2_computes_the_same():
     """What is compared with torch here, on a processor that would take the one for AVX-512."""
-    if torch.backends.cpu.get_cpu_capability() != "AVX512":
-        pytest.skip("here the other tests have tested the library for AVX2, or there is none")
-    subprocess.run(
-        [sys.executable, "-m", "pytest", "-n0", "-k", "of_torch or written or compiler", __file__],
-        env={**os.environ, "ATEN_CPU_CAPABILITY": "avx2", "I2I_EXPECT": "avx2"},
-        check=True, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+    run_with_avx2(__file__, "-k", "of_torch or written or compiler")
 
 
 def test_where_there_is_a_compiler_there_is_a_library():

@@ -1,11 +1,10 @@
 """Compiled products of matrices against torch's in double precision."""
 
 import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from avx2_run import run_with_avx2
 from torch.nn import functional
 
 from i2i.nn import native
@@ -265,10 +264,4 @@ def test_the_library_is_the_one_that_was_asked_for():
 
 @pytest.mark.skipif("I2I_EXPECT" in os.environ, reason="this is the run for AVX2")
 def test_the_library_for_avx2_multiplies_too():
-    if torch.backends.cpu.get_cpu_capability() != "AVX512":
-        pytest.skip("the library for AVX2 is the one that the other tests take, or there is none")
-    subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n", "0", __file__],
-        env={**os.environ, "ATEN_CPU_CAPABILITY": "avx2", "I2I_EXPECT": "avx2"},
-        check=True, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+    run_with_avx2(__file__)
