@@ -86,6 +86,7 @@ def is_built_for(tensor: Tensor, dtype: torch.dtype) -> bool:
         and tensor.device.type == "cpu"
         and (tensor.dtype, dtype) in _TYPES
         and tensor.numel() > 0
+        and not tensor.is_neg()  # numbers whose sign is still to be turned, as `z.conj().imag`
         and type(tensor) in (Tensor, torch.nn.Parameter)
         and library() is not None
     )
@@ -163,7 +164,7 @@ def turn_over(maps: Tensor, *, to_pixel_major: bool) -> Tensor:
 
 def turn_max_backward(maps: Tensor, grad: Tensor) -> Tensor:
     """Gradient of the maximum over turns: (P, 4, C, B), float32 or float64, and (P, C, B)."""
-    maps, grad = maps.contiguous(), grad.to(maps.dtype).contiguous()
+    maps, grad = in_order(maps), in_order(grad.to(maps.dtype))
     result = torch.empty_like(maps)
     functions().i2i_turn_max_backward(
         *map(pointer, (maps, grad, result)),
@@ -266,8 +267,8 @@ def norm(
         relu: Whether to clip.
         fresh: Take the moments of ``x``, and write them to ``moments``.
     """
-    x, weight, bias = x.contiguous(), weight.contiguous(), bias.contiguous()
-    shortcut = None if shortcut is None else shortcut.contiguous()
+    x, weight, bias = in_order(x), in_order(weight), in_order(bias)
+    shortcut = None if shortcut is None else in_order(shortcut)
     y = torch.empty_like(x)
     functions().i2i_norm(
         *map(pointer, (x, shortcut, weight, bias, *moments, y)),
@@ -322,7 +323,7 @@ def norm_backward(
     fields = x.shape[-2]
     sums, count = given or (moments.new_empty(2, fields), x.numel() / fields)
     of_x, of_shortcut = (torch.empty_like(x) if wanted else None for wanted in wants)
-    arrays = (grad.contiguous(), clipped, x, weight.contiguous(), *moments, sums)
+    arrays = (in_order(grad), clipped, x, in_order(weight), *moments, sums)
     functions().i2i_norm_backward(
         *map(pointer, (*arrays, of_x, of_shortcut)),
         ctypes.c_double(eps),
@@ -331,6 +332,11 @@ def norm_backward(
         *_rows(x),
     )
     return of_x, of_shortcut, sums
+
+
+def in_order(tensor: Tensor) -> Tensor:
+    """Itself, or a copy: contiguous, its numbers in memory as they are (no sign left to turn)."""
+    return tensor.resolve_neg().contiguous()
 
 
 def pointer(tensor: Tensor | None) -> ctypes.c_void_p:

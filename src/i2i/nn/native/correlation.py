@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
-from i2i.nn.native import functions, is_built_for, pointer
+from i2i.nn.native import functions, in_order, is_built_for, pointer
 
 
 def can_correlate(signal: Tensor, spheres: Tensor) -> bool:
@@ -68,7 +68,7 @@ class _Correlate(torch.autograd.Function):
         wants_signal, wants_spheres, *_ = ctx.needs_input_grad  # type: ignore[attr-defined]
         of_signal = torch.empty_like(signal) if wants_signal else None
         of_spheres = torch.zeros_like(spheres) if wants_spheres else None
-        grad = grad.contiguous()  # with a name: it has to last until the call is over
+        grad = in_order(grad)  # with a name: it has to last until the call is over
         functions().i2i_correlate_backward(
             *map(pointer, (grad, signal, spheres, index, moved, of_signal, of_spheres)),
             *_sizes(signal, spheres, moved),

@@ -9,10 +9,9 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
-#include <utility>
 #include <vector>
 
-#include "lanes.h"
+#include "turning.h"
 
 extern "C" {
 
@@ -83,76 +82,49 @@ T* room(int64_t size) {
   return first;
 }
 
-// A tile of c. Ordered: a[k][i] of whole tiles; otherwise rows of a matrix.
-template <class T, bool kOrdered>
+// A tile of c, or the part of it in its first kVectors. Ordered: a[k][i] of whole tiles; otherwise
+// rows of a matrix.
+template <class T, bool kOrdered, int kVectors>
 void tile(const T* a, int64_t row_step, const T* b, int64_t depth, T* c, int64_t pitch,
           const Finish<T>& finish) {
   constexpr int size = Lane<T>::size;
-  typename Lane<T>::Vec sums[kTileRows][kTileVectors] = {};
+  typename Lane<T>::Vec sums[kTileRows][kVectors] = {};
   const int64_t step = kOrdered ? 1 : row_step;
   const T* rows[kTileRows / kRowsAtOnce];
 #pragma GCC unroll 12
   for (int i = 0; i < kTileRows / kRowsAtOnce; ++i) rows[i] = a + i * kRowsAtOnce * step;
   for (int64_t k = 0; k < depth; ++k) {
-    typename Lane<T>::Vec row[kTileVectors];
+    typename Lane<T>::Vec row[kVectors];
 #pragma GCC unroll 2
-    for (int v = 0; v < kTileVectors; ++v) {
+    for (int v = 0; v < kVectors; ++v) {
       row[v] = load_one<T>(b + k * kTileVectors * size + v * size, size);
     }
 #pragma GCC unroll 12
     for (int i = 0; i < kTileRows; ++i) {
       const T value = rows[i / kRowsAtOnce][i % kRowsAtOnce * step];
 #pragma GCC unroll 2
-      for (int v = 0; v < kTileVectors; ++v) sums[i][v] += value * row[v];
+      for (int v = 0; v < kVectors; ++v) sums[i][v] += value * row[v];
     }
 #pragma GCC unroll 12
     for (auto& at : rows) at += kOrdered ? kTileRows : 1;
   }
   for (int i = 0; i < kTileRows; ++i) {
-    for (int v = 0; v < kTileVectors; ++v) {
+    for (int v = 0; v < kVectors; ++v) {
       T* at = c + i * pitch + v * size;
       store_one<T>(at, size, finish(sums[i][v], at, v * size, size));
     }
   }
 }
 
-#if defined(__has_builtin)
-#if __has_builtin(__builtin_shufflevector)
-#define I2I_HAS_SHUFFLES
-#endif
-#endif
-
-#if defined(I2I_HAS_SHUFFLES)
-// The lower or upper halves of two vectors, one number of each in turn.
-template <class V, size_t... lane>
-V in_turn(V first, V second, bool upper, std::index_sequence<lane...>) {
-  constexpr int size = sizeof...(lane);
-  if (upper) {
-    return __builtin_shufflevector(first, second, (size / 2 + lane / 2 + lane % 2 * size)...);
-  }
-  return __builtin_shufflevector(first, second, (lane / 2 + lane % 2 * size)...);
-}
-
 // Columns that lie one after the other in memory, `step` apart, to rows `width` apart; a vector each.
 template <class T>
 void turn_over(const T* from, int64_t step, T* to, int64_t width) {
   constexpr int size = Lane<T>::size;
-  const auto lanes = std::make_index_sequence<size>();
-  typename Lane<T>::Vec now[size], next[size];
-  for (int i = 0; i < size; ++i) now[i] = load_one<T>(from + i * step, size);
-#pragma GCC unroll 4
-  for (int done = 1; done < size; done *= 2) {
-#pragma GCC unroll 8
-    for (int i = 0; i < size / 2; ++i) {
-      next[2 * i] = in_turn(now[i], now[i + size / 2], false, lanes);
-      next[2 * i + 1] = in_turn(now[i], now[i + size / 2], true, lanes);
-    }
-#pragma GCC unroll 16
-    for (int i = 0; i < size; ++i) now[i] = next[i];
-  }
-  for (int i = 0; i < size; ++i) store_one<T>(to + i * width, size, now[i]);
+  typename Lane<T>::Vec lines[size];
+  for (int i = 0; i < size; ++i) lines[i] = load_one<T>(from + i * step, size);
+  turn<T, size>(lines);
+  for (int i = 0; i < size; ++i) store_one<T>(to + i * width, size, lines[i]);
 }
-#endif
 
 // Columns of b as tiles want them: (tile, k, column), filled up with zeros.
 template <class T>
@@ -161,12 +133,10 @@ void order_right(const Matrix<T>& b, int64_t depth, int64_t columns, T* to) {
   for (int64_t j = 0; j < columns; j += width) {
     const int count = static_cast<int>(std::min<int64_t>(width, columns - j));
     int64_t k = 0;
-#if defined(I2I_HAS_SHUFFLES)
     constexpr int size = Lane<T>::size;
     for (; b.row == 1 && count == width && k + size <= depth; k += size, to += size * width) {
       for (int c = 0; c < width; c += size) turn_over(b.at(k, j + c), b.column, to + c, width);
     }
-#endif
     for (; k < depth; ++k, to += width) {
       const T* from = b.at(k, j);
       if (b.column == 1) {
@@ -209,12 +179,14 @@ void tiles_of_rows(const T* a, int64_t row_step, const T* b, int64_t depth, int 
   constexpr int width = kTileColumns<T>;
   for (int64_t j = 0; j < columns; j += width, b += depth * width) {
     const int count = static_cast<int>(std::min<int64_t>(width, columns - j));
-    if (rows == kTileRows && count == width) {
-      tile<T, kOrdered>(a, row_step, b, depth, c + j, pitch, finish.from(j));
+    const bool is_narrow = count <= Lane<T>::size;
+    const auto sum = is_narrow ? tile<T, kOrdered, 1> : tile<T, kOrdered, kTileVectors>;
+    if (rows == kTileRows && count == (is_narrow ? Lane<T>::size : width)) {
+      sum(a, row_step, b, depth, c + j, pitch, finish.from(j));
       continue;
     }
     alignas(kLineBytes) T edge[kTileRows * width];
-    tile<T, kOrdered>(a, row_step, b, depth, edge, width, {false, nullptr, false});
+    sum(a, row_step, b, depth, edge, width, {false, nullptr, false});
     for (int i = 0; i < rows; ++i) {
       T* at = c + i * pitch + j;
       for (int x = 0; x < count; ++x) at[x] = finish(edge[i * width + x], at + x, j + x, 1);

@@ -9,23 +9,25 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 
-from i2i.nn.native import functions, is_built_for, library, pointer
+from i2i.nn.native import functions, in_order, is_built_for, library, pointer
+from i2i.nn.precision import full_precision
 
 _LEAST_MULTIPLICATIONS = 1 << 16  # below, what a call costs is more than what it saves
 
 
 @torch.no_grad()
 def multiply(left: Tensor, right: Tensor, *, out: Tensor | None = None) -> Tensor:
-    """`left @ right` without a gradient.
+    """`left @ right` without a gradient, in the type of the two, under autocast as well.
 
     Args:
         left: (M, K), or n of them: (n, M, K). Of any strides, like `right`.
         right: (K, N), or n of them; one with several on the other side meets each of them.
         out: Where to write, (M, N) or (n, M, N), its rows contiguous; made if it is not given.
     """
-    if not _is_fast(left, right):
+    if _is_fast(left, right):
+        return _multiply(left, right, out)
+    with full_precision(left):
         return torch.matmul(left, right, out=out)
-    return _multiply(left, right, out)
 
 
 def product(left: Tensor, right: Tensor) -> Tensor:
@@ -169,7 +171,7 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: FunctionCtx, x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
-        out = _multiply(x, weight.mT, bias=bias.contiguous(), relu=relu)
+        out = _multiply(x, weight.mT, bias=in_order(bias), relu=relu)
         of_x, of_weight, *_ = ctx.needs_input_grad  # type: ignore[attr-defined]
         kept = [x if of_weight else None, weight if of_x else None, *([out] if relu else [])]
         ctx.save_for_backward(*kept)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass
 import torch
 from torch import Tensor
 
-from i2i.nn.native import functions, pointer
+from i2i.nn.native import functions, in_order, pointer
 
 MAX_WINDOW = 15  # a place in the window and "clipped" have to fit into a byte
 
@@ -97,7 +97,7 @@ def forward(
 
 def backward(images: Tensor, grad: Tensor, places: Tensor, geometry: StemGeometry) -> Tensor:
     """Gradient (channels, K + 1), float64, of the weight of :func:`forward`."""
-    rows = grad.permute(0, 2, 3, 1).contiguous()
+    rows = in_order(grad.permute(0, 2, 3, 1))
     size = images.shape[1] * geometry.kernel**2 + 1
     result = images.new_empty(rows.shape[-1], size, dtype=torch.float64)
     _call("i2i_stem_backward", images, geometry, len(result), rows, places, result)
