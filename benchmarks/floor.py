@@ -62,11 +62,8 @@ def multiplications(net: nn.Module, batch: dict[str, torch.Tensor]) -> dict[str,
         hook.remove()
     head = net.trunk.group_conv
     size = len(next(iter(batch.values())))
-    place = head.features + head.pairs.shape[1]  # a product with f, then with the 0/1 matrix
-    found["trunk.group_conv"] = (
-        float(size * head.num_vertices * head.sphere_size * head.out_features * place),
-        3,
-    )
+    met = int(head.pairs.any(dim=1).sum())  # pairs of places that some element puts together
+    found["trunk.group_conv"] = (float(size * met * head.features * head.out_features), 3)
     return found
 
 

@@ -39,7 +39,7 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     if processes > 1:
         meeting = f"file://{folder}/meeting"
         distributed.init_process_group("gloo", meeting, rank=rank, world_size=processes)
-        model = DistributedDataParallel(model)
+        model = DistributedDataParallel(model, gradient_as_bucket_view=True)
         share_batch(model)
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-4, momentum=0.9, nesterov=True)
     seconds, losses = [], []

@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
@@ -223,6 +224,9 @@ def _trainer(cfg: DictConfig, folder: RunFolder) -> Trainer:
         default_root_dir=str(folder.path),
         _convert_="all",
     )
+    if isinstance(trainer.strategy, DDPStrategy):
+        # Gradients are added up where they lie: torch would copy them to its buckets and back.
+        trainer.strategy._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
     _check_processes(cfg, trainer)
     return trainer
 

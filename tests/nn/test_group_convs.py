@@ -172,6 +172,25 @@ def test_the_compiled_sums_and_their_gradients_are_those_of_torch(
         assert ((value - reference).norm() / reference.norm()).item() < tolerance
 
 
+@needs_library
+@pytest.mark.parametrize("outputs", [1, 3, 8, 12, 17])
+def test_elements_that_move_places_anywhere(outputs):
+    """Places of the signal that meet few of the sphere, or all, in ranges that overlap."""
+    torch.manual_seed(0)
+    moved = torch.stack([torch.randint(low, high, (11,)) for low, high in
+                         [(0, 45), (3, 7), (44, 45), (5, 30), (3, 7)]]).int()  # fmt: skip
+    signal = torch.randn(3, 5, 18 * outputs, dtype=torch.float64, requires_grad=True)
+    spheres = torch.randn(2, 45, 18, dtype=torch.float64, requires_grad=True)
+    index = torch.tensor([1, 0, 1])
+    out = correlate(signal, spheres, index, moved)
+    places = spheres[index][:, moved.long()]  # (images, places of the signal, elements, features)
+    expected = torch.einsum("bvgn,bvnm->bgm", places, signal.unflatten(2, (18, outputs)))
+    torch.testing.assert_close(out, expected)
+    upstream = torch.randn_like(out)
+    ours = torch.autograd.grad(out, [signal, spheres], upstream)
+    torch.testing.assert_close(ours, torch.autograd.grad(expected, [signal, spheres], upstream))
+
+
 @pytest.mark.usefixtures("both_forms")
 def test_a_signal_of_any_strides_and_what_is_not_a_number():
     torch.manual_seed(0)

@@ -17,7 +17,9 @@ pytestmark = pytest.mark.skipif(
 )
 TYPES = [(torch.float32, 1e-6), (torch.float64, 1e-14)]
 # Rows, depth, columns: one number, broken tiles, several passes over depth and columns.
-SIZES = [(1, 1, 1), (12, 5, 32), (13, 50, 33), (50, 700, 40), (30, 20, 600), (25, 1300, 530)]
+SIZES = [
+    (1, 1, 1), (12, 5, 32), (13, 50, 33), (24, 35, 48), (50, 700, 40), (30, 20, 600), (25, 1300, 530),
+]  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -194,7 +196,7 @@ def test_gradients_of_linear_layers(shape, relu):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), TYPES)
-@pytest.mark.parametrize(("depth", "outs"), [(5, 4), (1500, 40), (30, 1100)])
+@pytest.mark.parametrize(("depth", "outs"), [(5, 4), (1500, 40), (1500, 48), (30, 1100)])
 def test_linear_layers_are_those_of_torch(depth, outs, dtype, tolerance):
     """The bias is added once, and what is clipped is the whole sum."""
     x, weight, bias = torch.randn(3, 7, depth), torch.randn(outs, depth), 10 * torch.randn(outs)
@@ -225,6 +227,15 @@ def test_autocast_is_that_of_torch():
             expected = functional.linear(left, right.mT, bias)
             assert ours.dtype == expected.dtype == torch.bfloat16
             assert torch.equal(ours, expected.relu() if relu else expected)
+
+
+@pytest.mark.parametrize("is_fast", [True, False])
+def test_products_without_a_gradient_keep_their_type_under_autocast(is_fast, monkeypatch):
+    monkeypatch.setattr(products, "_has_fast_products", lambda: is_fast)
+    left, right = torch.randn(50, 60), torch.randn(60, 70)
+    with torch.autocast("cpu", torch.bfloat16):
+        ours = multiply(left, right)
+    torch.testing.assert_close(ours, left @ right)
 
 
 def test_what_is_torchs_does_not_reach_the_library(monkeypatch):

@@ -14,8 +14,9 @@ class GroupCorrelation(nn.Module):
     `out[b, g, m] = Σ_v Σ_n f[moved[g, v], n] ψ[b, v, n, m] + bias[m]`.
 
     The tensor over elements, places and features is never made: ψ is multiplied with the features
-    of all V places, and the right pairs are added up for each of the 60 elements. `native` does it
-    an image at a time; by torch a constant 0/1 matrix adds up.
+    of the places, and the right pairs are added up for each of the 60 elements. `native` does it
+    an image at a time, with the places that some element puts against each v; torch takes all V,
+    and a constant 0/1 matrix adds up.
 
     Args:
         features: Width n of f.
