@@ -1,4 +1,4 @@
-"""Tensors whose sign is still to be turned (`z.conj().imag`): compiled code reads memory as it is."""
+"""Tensors whose sign is still to be turned (`z.conj().imag`): what lies in memory is not them."""
 
 import pytest
 import torch

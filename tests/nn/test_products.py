@@ -18,7 +18,8 @@ pytestmark = pytest.mark.skipif(
 TYPES = [(torch.float32, 1e-6), (torch.float64, 1e-14)]
 # Rows, depth, columns: one number, broken tiles, several passes over depth and columns.
 SIZES = [
-    (1, 1, 1), (12, 5, 32), (13, 50, 33), (24, 35, 48), (50, 700, 40), (30, 20, 600), (25, 1300, 530),
+    (1, 1, 1), (12, 5, 32), (13, 50, 33), (24, 35, 48),
+    (50, 700, 40), (30, 20, 600), (25, 1300, 530),
 ]  # fmt: skip
 
 
