@@ -172,14 +172,22 @@ def test_the_compiled_sums_and_their_gradients_are_those_of_torch(
         assert ((value - reference).norm() / reference.norm()).item() < tolerance
 
 
+# First and last place of the sphere that meets a place of the signal: alone, equal, overlapping,
+# with the same beginning or the same end.
+RANGES = [(0, 44), (3, 6), (44, 44), (9, 29), (3, 6), (3, 25), (5, 29)]
+
+
 @needs_library
+@pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("outputs", [1, 3, 8, 12, 17])
-def test_elements_that_move_places_anywhere(outputs):
-    """Places of the signal that meet few of the sphere, or all, in ranges that overlap."""
+def test_elements_that_move_places_anywhere(outputs, threads):
     torch.manual_seed(0)
-    moved = torch.stack([torch.randint(low, high, (11,)) for low, high in
-                         [(0, 45), (3, 7), (44, 45), (5, 30), (3, 7)]]).int()  # fmt: skip
-    signal = torch.randn(3, 5, 18 * outputs, dtype=torch.float64, requires_grad=True)
+    torch.set_num_threads(threads)
+    moved = torch.stack([
+        torch.cat([torch.randint(low, high + 1, (9,)), torch.tensor([low, high])])
+        for low, high in RANGES
+    ]).int()  # fmt: skip
+    signal = torch.randn(3, len(RANGES), 18 * outputs, dtype=torch.float64, requires_grad=True)
     spheres = torch.randn(2, 45, 18, dtype=torch.float64, requires_grad=True)
     index = torch.tensor([1, 0, 1])
     out = correlate(signal, spheres, index, moved)
