@@ -3,9 +3,11 @@
 python benchmarks/processes.py                       # scale=paper, batch 64, some minutes
 python benchmarks/processes.py --scale small --steps 20
 
-Rounds of both by turns, each in fresh processes; the time of a step is the median within a round,
-counted in all processes from a common start. Both see the same joint batches and begin from the
-same weights, so that their losses agree up to rounding; the largest difference is printed.
+Rounds by turns, each in fresh processes; the time of a step is the median within a round, counted
+in all processes from a common start. Both see the same joint batches and begin from the same
+weights, so that their losses agree up to rounding; the largest difference is printed. Beside them
+stand two processes that train on half the batch each and tell each other nothing: what is left of
+their time is not for any exchange to save.
 """
 
 import argparse
@@ -26,7 +28,13 @@ from network_speed import network
 THREADS = 2
 
 
-def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> None:
+# Processes, and whether they share a batch.
+ONE, TOGETHER, APART = (1, False), (2, True), (2, False)
+
+
+def run(
+    rank: int, processes: int, are_joined: bool, folder: str, options: argparse.Namespace
+) -> None:
     """Train a few steps as one of `processes`, and leave seconds and losses in the folder."""
     reuse_memory()
     torch.set_num_threads(THREADS // processes)
@@ -36,7 +44,7 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
             module.reg_on = "gt_always"
     net.train()
     model: nn.Module = Loss(net)
-    if processes > 1:
+    if are_joined:
         meeting = f"file://{folder}/meeting"
         distributed.init_process_group("gloo", meeting, rank=rank, world_size=processes)
         model = DistributedDataParallel(model, gradient_as_bucket_view=True)
@@ -46,7 +54,7 @@ def run(rank: int, processes: int, folder: str, options: argparse.Namespace) -> 
     for step in range(options.warm_up + options.steps):
         joint = noise_batch(info, options.batch, seed=step)
         batch = {name: value.chunk(processes)[rank] for name, value in joint.items()}
-        if processes > 1:
+        if are_joined:
             distributed.barrier()
         start = time.perf_counter()
         loss = model(batch)
@@ -71,10 +79,11 @@ class Loss(nn.Module):
         return torch.stack(list(self.net.loss(self.net(batch), batch).values())).sum()
 
 
-def one_round(processes: int, options: argparse.Namespace) -> tuple[float, torch.Tensor]:
+def one_round(kind: tuple[int, bool], options: argparse.Namespace) -> tuple[float, torch.Tensor]:
     """Seconds of a step, and the losses of the joint batches."""
+    processes, _ = kind
     with tempfile.TemporaryDirectory() as folder:
-        torch.multiprocessing.spawn(run, (processes, folder, options), nprocs=processes)
+        torch.multiprocessing.spawn(run, (*kind, folder, options), nprocs=processes)
         parts = [torch.load(Path(folder) / f"{rank}.pt") for rank in range(processes)]
     slowest = [max(times) for times in zip(*(part[0] for part in parts), strict=True)]
     losses = torch.tensor([part[1] for part in parts], dtype=torch.float64).mean(dim=0)
@@ -86,25 +95,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scale", default="paper")
     parser.add_argument("--batch", type=int, default=64, help="of all processes together")
-    parser.add_argument("--steps", type=int, default=5)
-    parser.add_argument("--warm-up", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=8)
+    parser.add_argument("--warm-up", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
-    seconds: dict[int, list[float]] = {1: [], 2: []}
+    seconds: dict[tuple[int, bool], list[float]] = {ONE: [], TOGETHER: [], APART: []}
     losses = {}
     for _ in range(options.rounds):
-        for processes in seconds:
-            time_, losses[processes] = one_round(processes, options)
-            seconds[processes].append(time_)
-    for processes, times in seconds.items():
-        low, high = min(times) * 1e3, max(times) * 1e3
-        print(
-            f"{processes} process(es), {THREADS // processes} thread(s) each: "
-            f"{statistics.median(times) * 1e3:.0f} ms a step [{low:.0f}, {high:.0f}]"
-        )
-    ratio = statistics.median(seconds[1]) / statistics.median(seconds[2])
-    print(f"two processes are {ratio:.2f} times as fast as one")
-    differences = (losses[1] - losses[2]).abs() / losses[1].abs()
+        for kind in seconds:
+            time_, losses[kind] = one_round(kind, options)
+            seconds[kind].append(time_)
+    middle = {kind: statistics.median(times) for kind, times in seconds.items()}
+    for kind, title in (
+        (ONE, f"one process, {THREADS} threads"),
+        (TOGETHER, "two processes (DDP), one thread each"),
+        (APART, "two that exchange nothing, one thread each"),
+    ):
+        low, high = min(seconds[kind]) * 1e3, max(seconds[kind]) * 1e3
+        print(f"{title}: {middle[kind] * 1e3:.0f} ms a step [{low:.0f}, {high:.0f}]")
+    print(f"two processes are {middle[ONE] / middle[TOGETHER]:.2f} times as fast as one;")
+    print(f"with exchanges that take no time they would be {middle[ONE] / middle[APART]:.2f} times")
+    differences = (losses[ONE] - losses[TOGETHER]).abs() / losses[ONE].abs()
     print(f"largest relative difference of the losses {differences.max().item():.1e}")
 
 
