@@ -26,8 +26,6 @@ from i2i.nn.data_parallel import share_batch
 from network_speed import network
 
 THREADS = 2
-
-
 # Processes, and whether they share a batch.
 ONE, TOGETHER, APART = (1, False), (2, True), (2, False)
 

@@ -8,6 +8,7 @@ from i2i.nn.c4 import C4Conv, group_max_pool, regular_type
 from i2i.nn.c4_norm import C4BatchNorm
 from i2i.nn.c4_stem import stem_map
 from i2i.nn.group_convs import DynamicFilterConv
+from i2i.nn.native import products
 from i2i.nn.native.products import linear, multiply, product
 from i2i.nn.pixel_major import from_pixel_major, to_pixel_major, turn_max
 
@@ -37,6 +38,12 @@ FUNCTIONS = {
     "turns of a map": (group_max_pool, (3, 8, 5, 5)),
     "stem": (lambda x: stem_map(x, STEM, STEM_NORM, torch.nn.MaxPool2d(2)), (3, 4, 12, 12)),
 }
+
+
+@pytest.fixture(autouse=True)
+def products_are_taken(monkeypatch):
+    """Also on processors where torch's own are."""
+    monkeypatch.setattr(products, "_has_fast_products", lambda: True)
 
 
 def as_negative_view(x):

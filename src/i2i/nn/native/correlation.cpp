@@ -10,7 +10,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <numeric>
 #include <vector>
 
 #include "patches.h"
@@ -61,8 +60,8 @@ struct Tile {
     }
   }
 
-  // Column by column, `step` apart, `count` numbers of each, up to the `end`th. More are written, which
-  // the next columns write over, but not past the last one's.
+  // Column by column, `step` apart, `count` numbers of each, up to the `end`th. More are written,
+  // which the next columns write over, but not past the last one's.
   void store_turned(T* to, int64_t step, int64_t end, int count) {
 #pragma GCC unroll 3
     for (int v = 0; v < kVectors; ++v) {
@@ -99,7 +98,8 @@ void each_tile(int64_t columns, const Act& act) {
   }
 }
 
-// Calls act(first, how many) for the rows, kSide at a time, the last ones first.
+// Calls act(first, how many) for the rows, kSide at a time. The last ones first: if they are fewer,
+// what `store_turned` writes too much belongs to the first ones.
 template <class Act>
 void each_rows(int64_t rows, const Act& act) {
   for (int64_t first = (rows - 1) / kSide * kSide; first >= 0; first -= kSide) {
@@ -275,7 +275,8 @@ struct Gradients {
   }
 };
 
-// Spheres (place, feature) with rows of `wide` numbers, as they are or (feature, place).
+// Spheres (place, feature) with rows of `wide` numbers, as they are or (feature, place), and behind
+// them a vector: the places of a meeting need not begin with one.
 template <class T>
 Ring<T> filled_up(const T* spheres, const I2iCorrelation& shape, int64_t wide, bool turned) {
   const int64_t rows = turned ? shape.features : shape.places;
